@@ -2,6 +2,7 @@
 
 __all__ = [
     "ARMSTRONG_1994",
+    "ASTROM_1995",
     "BITTENCOURT_2012",
     "CANUDAS_1995",
     "DYNAMIXEL",
@@ -15,6 +16,10 @@ __all__ = [
 ARMSTRONG_1994 = (
     "B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, A survey of models, analysis tools and "
     "compensation methods for the control of machines with friction, Automatica, 1994"
+)
+ASTROM_1995 = (
+    "K. J. Åström, T. Hägglund, PID controllers: theory, design, and tuning, second edition, "
+    "1995, section 3.5"
 )
 CANUDAS_1995 = (
     "C. Canudas de Wit, H. Olsson, K. J. Åström, P. Lischinsky, A new model for control of "

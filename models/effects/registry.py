@@ -38,6 +38,7 @@ BUILT_IN = {
     "servo_gain": f"{_HOME}.servos:ServoGain",
     "servo_force_limit": f"{_HOME}.servos:ServoForceLimit",
     "servo_dead_band": f"{_HOME}.servos:ServoDeadBand",
+    "servo_integral_action": f"{_HOME}.servos:IntegralAction",
     "goal_speed_limit": f"{_HOME}.servos:GoalSpeedLimit",
     "goal_acceleration_limit": f"{_HOME}.servos:GoalAccelerationLimit",
     "goal_resolution": f"{_HOME}.servos:GoalResolution",

@@ -18,12 +18,13 @@ from npdr_ppl.language.effects import (
     ServoEffect,
     Uneven,
 )
-from npdr_ppl.models.effects.references import DYNAMIXEL, MUJOCO, TAO_1996
+from npdr_ppl.models.effects.references import ASTROM_1995, DYNAMIXEL, MUJOCO, TAO_1996
 
 __all__ = [
     "GoalAccelerationLimit",
     "GoalResolution",
     "GoalSpeedLimit",
+    "IntegralAction",
     "ServoDeadBand",
     "ServoForceLimit",
     "ServoGain",
@@ -97,10 +98,60 @@ class ServoDeadBand(ServoEffect):
         """Half-normal; 1 % of the rated excursion."""
         return {"width": dist.HalfNormal(0.01 * port.rated_position)}
 
-    def act(self, error: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+    def act(
+        self, error: Tensor, parameters: Mapping[str, Tensor], memory: Tensor | None
+    ) -> Tensor:
         """Returns e − clip(e, ±δ), an equal expression."""
         width = parameters["width"]
         return error - error.clamp(-width, width)
+
+
+class IntegralAction(ServoEffect):
+    """K (e + w), ẇ = r e while |w| < w_max: a servo with integral action that cannot wind up.
+
+    The integral part w stays within a limit, as in the position loops of servo drives. As a
+    rollout begins, w is zero: the servo has just been switched on at its goal.
+    """
+
+    id = "servo_integral_action"
+    parameters = (
+        Parameter("rate", "1/s", 0.0, "integral gain relative to K, 1/Tᵢ"),
+        Parameter("limit", "{coordinate}", math.inf, "greatest integral part w_max of the error"),
+    )
+    strength = ("rate",)
+    law = "K (e + w), ẇ = r e, |w| ≤ w_max"
+    excitation = "hold"
+    reference = ASTROM_1995
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Half-normal, 3/s; log-normal about 5 % of the rated excursion."""
+        return {
+            "rate": dist.HalfNormal(3.0),
+            "limit": dist.LogNormal(math.log(0.05 * port.rated_position), _SPREAD),
+        }
+
+    def initial_memory(self, error: Tensor) -> Tensor:
+        """Returns an integral part of zero."""
+        return torch.zeros_like(error)
+
+    def act(
+        self, error: Tensor, parameters: Mapping[str, Tensor], memory: Tensor | None
+    ) -> Tensor:
+        """Returns e + w."""
+        assert memory is not None
+        return error + memory
+
+    def next_memory(
+        self,
+        error: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Tensor | None,
+        time_step: float,
+    ) -> Tensor:
+        """Returns w + h r e within its limit."""
+        assert memory is not None
+        grown = memory + time_step * parameters["rate"] * error
+        return torch.maximum(torch.minimum(grown, parameters["limit"]), -parameters["limit"])
 
 
 class _GoalEffect(ActionEffect):

@@ -77,6 +77,7 @@ EFFECTS = (
     "servo_gain",
     "servo_force_limit",
     "servo_dead_band",
+    "servo_integral_action",
     "goal_speed_limit",
     "goal_acceleration_limit",
     "goal_resolution",

@@ -42,6 +42,7 @@ TITLES = {
     "servo_dead_band": "{where} dead band",
     "servo_force_limit": "{where} force limit",
     "servo_gain": "{where} servo gain error",
+    "servo_integral_action": "{where} integral action",
     "spring": "spring at {joint}",
     "stribeck_friction": "Stribeck friction at {joint}",
     "supply_sag": "supply sag of {where}",

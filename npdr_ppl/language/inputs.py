@@ -50,8 +50,10 @@ class Inputs:
         is_read: Whether each channel was measured after each step, ``(S, K, C)``; ``None`` if all
             were, at the end of the step.
         lateness: Time from the end of the step to the measurement, in steps, ``(S, K, C)``.
-        recorded: Measurements of all R rollouts, from their first step on, ``(R, T, C)``; forces
-            that depend on past motion need them. ``None`` if the past motion is unknown.
+        recorded_actions: Commands of whole rollouts, zero beyond their ends, ``(R, T, A)``; states
+            that sum up the whole past, such as a servo's integral, need them.
+        recorded_readings: Measurements before each step of whole rollouts, ``(R, T, C)``; forces
+            and servos that depend on past motion need them. ``None`` if the motion is unknown.
     """
 
     actions: Tensor
@@ -69,7 +71,8 @@ class Inputs:
     initial_rate_errors: Tensor | None = None
     is_read: Tensor | None = None
     lateness: Tensor | None = None
-    recorded: Tensor | None = None
+    recorded_actions: Tensor | None = None
+    recorded_readings: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks that the shapes match."""
@@ -209,8 +212,10 @@ class Inputs:
             self,
             **self._starts(lambda value: value[..., columns]),
             **self._sampling(lambda value: value[..., columns]),
+            recorded_readings=None
+            if self.recorded_readings is None
+            else self.recorded_readings[..., columns],
             channel_names=tuple(names),
-            recorded=None if self.recorded is None else self.recorded[..., columns],
         )
 
     def earlier(self, name: str, steps: Tensor) -> Tensor | None:
@@ -225,10 +230,10 @@ class Inputs:
         Returns:
             ``None`` if they are unknown.
         """
-        if self.recorded is None or name not in self.channel_names:
+        if self.recorded_readings is None or name not in self.channel_names:
             return None
         rows = (self.start - steps[:, None]).clamp_min(0)
-        return self.recorded[self.rollout, rows, self.channel_names.index(name)]
+        return self.recorded_readings[self.rollout, rows, self.channel_names.index(name)]
 
     def element(self, index: int) -> "Inputs":
         """Returns the inputs of one element of the (flattened) batch; unbatched ones unchanged."""

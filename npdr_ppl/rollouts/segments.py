@@ -142,27 +142,27 @@ def cut(
         mask=torch.tensor(mask),
         rollout=torch.tensor([rollout for rollout, _, _ in layout]),
         start=torch.tensor([start for _, start, _ in layout]),
-        recorded=_recorded(rollouts, dtype),
+        recorded_actions=_padded(rollouts.actions, max(rollouts.lengths), dtype),
+        recorded_readings=_recorded(rollouts, dtype),
         **sampling,
         **{name: torch.tensor(value, dtype=dtype) for name, value in starts.items()},
     )
 
 
 def _recorded(rollouts: Recording, dtype: torch.dtype) -> Tensor | None:
-    """Returns the measurements of all rollouts, ``(R, T, C)``; missing ones are interpolated.
+    """Returns what was measured before each step, ``(R, T, C)``; missing values are interpolated.
 
     ``None`` if they would take more than 32 MiB.
     """
-    longest = max(len(readings) for readings in rollouts.readings)
-    result = np.zeros((len(rollouts), longest, len(rollouts.channel_names)))
+    num_steps = max(rollouts.lengths)
+    result = np.zeros((len(rollouts), num_steps, len(rollouts.channel_names)))
     if result.size > _MOST_PAST_VALUES:
         return None
     for row, readings in zip(result, rollouts.readings, strict=True):
-        steps = np.arange(len(row))
-        for column, values in zip(row.T, readings.T, strict=True):
+        for column, values in zip(row.T, readings[:num_steps].T, strict=True):
             known = np.isfinite(values).nonzero()[0]
             if len(known):
-                column[:] = np.interp(steps, known, values[known])
+                column[:] = np.interp(np.arange(num_steps), known, values[known])
     return torch.tensor(result, dtype=dtype)
 
 
@@ -184,6 +184,15 @@ def observation(
         layout = layout_of(rollouts, inputs)
         num_steps, dtype = max(stop - start for _, start, stop in layout), torch.float64
     result = _after_steps(rollouts, layout, num_steps, "values")[..., columns]
+    return torch.tensor(result, dtype=dtype)
+
+
+def _padded(series: Sequence[NDArray[np.float64]], num_steps: int, dtype: torch.dtype) -> Tensor:
+    """Returns the first steps of series, ``(R, num_steps, columns)``, with zeros at their ends."""
+    result = np.zeros((len(series), num_steps, series[0].shape[-1]))
+    for row, values in zip(result, series, strict=True):
+        known = values[:num_steps]
+        row[: len(known)] = known
     return torch.tensor(result, dtype=dtype)
 
 

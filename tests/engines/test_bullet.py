@@ -38,7 +38,7 @@ PORTS = {
 REFUSED = {
     "backlash", "clock_skew", "contact", "joint_elasticity", "load_dependent_friction", "payload",
     "presliding_friction", "sensor_delay", "servo_gain", "servo_force_limit", "servo_dead_band",
-    "goal_speed_limit", "goal_acceleration_limit", "goal_resolution",
+    "servo_integral_action", "goal_speed_limit", "goal_acceleration_limit", "goal_resolution",
 }  # fmt: skip
 
 # Bullet works in float64 here and its Featherstone dynamics of one joint are the same formula.

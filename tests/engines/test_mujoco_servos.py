@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import npdr_ppl as npdr
 from npdr_ppl.discovery.screening.sensitivities import _probe
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.mujoco import MujocoSimulator
@@ -18,6 +19,7 @@ from npdr_ppl.models.effects import (
     GoalResolution,
     GoalSpeedLimit,
     InputDelay,
+    IntegralAction,
     Saturation,
     ServoDeadBand,
     ServoForceLimit,
@@ -99,6 +101,69 @@ def test_a_saturated_servo_loses_nothing_by_a_dead_band():
 
     expected = written_out(law, commands)
     torch.testing.assert_close(reached[:, 0], expected, atol=1e-12, rtol=0.0)
+
+
+INTEGRAL = {"rate": 4.0, "limit": 0.03}
+
+
+def summed_up(commands, rate, limit, load=0.0):
+    """Positions of a joint whose servo has integral action with clamping, written out."""
+    integral = 0.0
+
+    def law(error, velocity):
+        nonlocal integral
+        force = GAIN * (error + integral) - DAMPING * velocity + load
+        integral = min(max(integral + STEP * rate * error, -limit), limit)
+        return force
+
+    return written_out(law, commands)
+
+
+@pytest.mark.parametrize("limit", [math.inf, 0.03])
+def test_integral_action_sums_up_the_error_up_to_its_limit(limit):
+    effect = IntegralAction("goal")
+    commands = np.r_[np.zeros(20), np.full(200, 0.3), np.full(200, -0.1)]
+    given = {f"{effect.name}.{name}": value([0.0, own]) for name, own in INTEGRAL.items()}
+    given[f"{effect.name}.limit"] = value([0.03, limit])
+    out = joint().with_effects(effect).simulate(given, goals(commands))
+    assert torch.equal(out[0], joint().simulate({}, goals(commands)))
+    expected = summed_up(commands, INTEGRAL["rate"], limit)
+    torch.testing.assert_close(out[1, 0, :, 0], expected, atol=1e-12, rtol=0.0)
+    other = summed_up(commands, INTEGRAL["rate"], {math.inf: 0.03, 0.03: math.inf}[limit])
+    assert float((expected - other).abs().max()) > 1e-3
+
+
+def test_the_integral_of_a_running_rollout_is_known_from_the_recording():
+    """A segment that begins later continues the sum, with its limit, over the whole past."""
+    effect = IntegralAction("goal")
+    simulator = joint().with_effects(effect)
+    given = {f"{effect.name}.{name}": value(own) for name, own in INTEGRAL.items()}
+    commands = 0.3 * np.sin(np.linspace(0.0, 20.0, 4000)) + 0.2
+    (whole,) = simulator.simulate(given, goals(commands))
+    rollouts = npdr.Rollouts.from_arrays(
+        readings=[torch.cat((value([[0.0, 0.0]]), whole))],
+        actions=[commands[:, None]],
+        channel_names=["hinge", "hinge_velocity"],
+        action_names=["goal"],
+        time_step=STEP,
+    )
+    cut = rollouts.inputs(segment_length=500, initial_state="recorded", history=64)
+    parts = simulator.simulate(given, cut)
+    assert cut.num_segments == 8
+    torch.testing.assert_close(parts.flatten(0, 1), whole, atol=1e-10, rtol=0.0)
+    forgotten = simulator.simulate(given, replace(cut, recorded_actions=None))
+    assert float((forgotten.flatten(0, 1) - whole)[:, 0].abs().max()) > 0.01
+    # Four engine steps in each of the recording's: the same within the curvature of the motion.
+    finer = simulator.with_finer_steps().with_finer_steps()
+    (whole,) = finer.simulate(given, goals(commands))
+    cut = replace(cut, recorded_readings=torch.cat((value([[0.0, 0.0]]), whole[:-1]))[None])
+    starts = torch.cat((value([[0.0, 0.0]]), whole))[cut.start]
+    cut = replace(cut, initial_readings=starts, initial_values=starts)
+    parts = finer.simulate(given, cut)
+    torch.testing.assert_close(parts.flatten(0, 1)[:, 0], whole[:, 0], atol=1e-5, rtol=0.0)
+    # A batch of draws has the same states, whatever the chunk.
+    several = {name: own.expand(3) for name, own in given.items()}
+    torch.testing.assert_close(finer.simulate(several, cut)[1], parts)
 
 
 def test_a_force_limit_is_that_of_the_file():

@@ -56,5 +56,7 @@ def test_nothing_is_told_where_no_recording_is():
     inputs = make_case("furuta", "null", seed=3).fit.inputs(100)
     witness = Witness("pole")
     simulator = RIGS["furuta"].simulator().with_effects(witness)
-    simulator.simulate({"pole.witness.nothing": torch.zeros(1)}, replace(inputs, recorded=None))
+    simulator.simulate(
+        {"pole.witness.nothing": torch.zeros(1)}, replace(inputs, recorded_readings=None)
+    )
     assert witness.start.displacements == ()

@@ -49,6 +49,7 @@ class State(NamedTuple):
         action_memory: Own state of each action effect.
         past_commands: Past commands that each action effect may need, latest first.
         sensor_memory: Own state of each sensor effect for each of its channels.
+        servo_memory: Own state of each effect inside a servo.
     """
 
     positions: Components
@@ -57,6 +58,7 @@ class State(NamedTuple):
     action_memory: tuple[Any, ...] = ()
     past_commands: tuple[Components, ...] = ()
     sensor_memory: tuple[tuple[Any, ...], ...] = ()
+    servo_memory: tuple[Tensor | None, ...] = ()
 
 
 class Tables(NamedTuple):

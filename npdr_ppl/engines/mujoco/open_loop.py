@@ -23,6 +23,7 @@ from npdr_ppl.engines.common.segment_start import recorded_start, true_start, wi
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.native import run_all_steps
+from npdr_ppl.engines.mujoco.servo_past import with_recorded_past
 from npdr_ppl.engines.mujoco.stepper import MujocoStepper
 from npdr_ppl.language.inputs import Inputs
 
@@ -132,6 +133,15 @@ class _Replay:
                 num_past=past,
                 past_motion=self._past_motion(chain).part(first, last),
             )
+            servo_memory = with_recorded_past(
+                self.simulator,
+                self.inputs,
+                self.shape,
+                slice(first, last),
+                tables,
+                state.servo_memory,
+            )
+            state = state._replace(servo_memory=servo_memory)
             controls = self._controls(chain, state, tables, records, first, last)
             if chain.has_forces:
                 return self._step_by_step(chain, state, tables, controls)

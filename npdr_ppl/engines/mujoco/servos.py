@@ -110,14 +110,29 @@ class ServoErrors:
         joints = {actuator: actuated_joint(model, actuator) for _, _, actuator in effects}
         self._address = {a: int(model.jnt_qposadr[joint]) for a, joint in joints.items()}
 
-    def apply(self, tables: Tables) -> None:
-        """Changes the goals in the present state.
+    def initial_memory(self) -> tuple[Tensor | None, ...]:
+        """Returns the own state of each effect as a rollout begins."""
+        return tuple(effect.initial_memory(self._error(k)) for _, effect, k in self._effects)
+
+    def apply(
+        self, tables: Tables, memory: tuple[Tensor | None, ...], time_step: float
+    ) -> tuple[Tensor | None, ...]:
+        """Changes the goals in the present state, and returns the memory after the step.
 
         Args:
             tables: Parameters of the effects.
+            memory: Own state of each effect.
+            time_step: Seconds per engine step.
         """
-        for place, effect, actuator in self._effects:
-            position = self._positions[:, self._address[actuator]]
-            error = torch.from_numpy(self._goals[:, actuator] - position)
-            changed = effect.act(error, tables.effects[place])
+        later = []
+        for (place, effect, actuator), own in zip(self._effects, memory, strict=True):
+            error, values = self._error(actuator), tables.effects[place]
+            changed = effect.act(error, values, own)
             self._goals[:, actuator] += (changed - error).numpy()
+            later.append(effect.next_memory(error, values, own, time_step))
+        return tuple(later)
+
+    def _error(self, actuator: int) -> Tensor:
+        """Returns goal minus position, ``(N,)``."""
+        position = self._positions[:, self._address[actuator]]
+        return torch.from_numpy(self._goals[:, actuator] - position)

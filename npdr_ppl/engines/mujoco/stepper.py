@@ -84,6 +84,10 @@ class MujocoStepper(EffectChain):
         """Number of the simulator's states that are positions."""
         return sum(not component.is_velocity for component in self.simulator.components)
 
+    def start(self, *args: Any, **kwargs: Any) -> State:
+        """Returns the state at the start of an episode or segment; see the base class."""
+        return super().start(*args, **kwargs)._replace(servo_memory=self._servos.initial_memory())
+
     def place(self, components: tuple[Tensor, ...]) -> None:
         """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
         place_states(self.simulator, self._batch, components)
@@ -184,7 +188,8 @@ class MujocoStepper(EffectChain):
 
     def _move_once(self, state: State, tables: Tables, stage: int) -> State:
         """Advances all simulations by one engine step under the force effects."""
-        self._servos.apply(tables)
+        servo_memory = self._servos.apply(tables, state.servo_memory, self._engine_step)
+        state = state._replace(servo_memory=servo_memory)
         if not self.force_effects:
             self._guarded(self._batch.step, stage=stage)
             return state

@@ -13,6 +13,7 @@ __all__ = [
     "GoalResolution",
     "GoalSpeedLimit",
     "InputDelay",
+    "IntegralAction",
     "Saturation",
     "ServoDeadBand",
     "ServoLaw",
@@ -239,8 +240,16 @@ class ServoLaw:
 
     actuator: str | int
 
-    def act(self, error: float) -> float:
-        """Returns the error on which the servo acts, for the goal minus the position."""
+    def reset(self) -> None:
+        """Sets the own state as a rollout begins."""
+
+    def act(self, error: float, step: float) -> float:
+        """Returns the error on which the servo acts.
+
+        Args:
+            error: Goal minus position.
+            step: Seconds per engine step.
+        """
         raise NotImplementedError
 
 
@@ -250,6 +259,25 @@ class ServoDeadBand(ServoLaw):
 
     width: float
 
-    def act(self, error: float) -> float:
+    def act(self, error: float, step: float) -> float:
         """Returns the error on which the servo acts."""
         return error - clip(error, self.width)
+
+
+@dataclass
+class IntegralAction(ServoLaw):
+    """e + w, ẇ = r e, |w| ≤ w_max."""
+
+    rate: float
+    limit: float
+    integral: float = field(default=0.0, init=False, repr=False)
+
+    def reset(self) -> None:
+        """Sets the integral part to zero."""
+        self.integral = 0.0
+
+    def act(self, error: float, step: float) -> float:
+        """Returns the error on which the servo acts."""
+        acted = error + self.integral
+        self.integral = clip(self.integral + step * self.rate * error, self.limit)
+        return acted

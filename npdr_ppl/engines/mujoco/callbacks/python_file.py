@@ -49,6 +49,7 @@ LAWS: dict[str, type] = {
     "goal_speed_limit": command_laws.GoalSpeedLimit,
     "goal_acceleration_limit": command_laws.GoalAccelerationLimit,
     "goal_resolution": command_laws.GoalResolution,
+    "servo_integral_action": command_laws.IntegralAction,
     "servo_dead_band": command_laws.ServoDeadBand,
     "encoder_bias": sensor_laws.EncoderBias,
     "encoder_scale": sensor_laws.EncoderScale,

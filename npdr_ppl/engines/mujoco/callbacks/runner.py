@@ -69,6 +69,8 @@ class LawRunner:
         data.qfrc_applied[self.dofs] = 0.0
         for law, _, dof in self.forces:
             law.reset(float(data.qvel[dof]))
+        for law, _ in self.servos:
+            law.reset()
         values = self._true_values(data)
         step = self.substeps * float(self.model.opt.timestep)
         for law in self.sensors:
@@ -121,7 +123,8 @@ class LawRunner:
         model = self.model
         for law, i in self.servos:
             position = float(data.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
-            data.ctrl[i] = position + law.act(float(data.ctrl[i]) - position)
+            error = float(data.ctrl[i]) - position
+            data.ctrl[i] = position + law.act(error, float(model.opt.timestep))
         h, qpos, qvel, applied = model.opt.timestep, data.qpos, data.qvel, data.qfrc_applied
         middle = data.time + 0.5 * h
         joints = [Joint(float(qpos[q]), float(qvel[v]), middle, h) for _, q, v in self.forces]

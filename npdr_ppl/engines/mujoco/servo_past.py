@@ -1,0 +1,80 @@
+"""States of servos at the start of segments: what they summed up in the recorded past."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.common.effect_chain import Tables
+from npdr_ppl.engines.mujoco.fields import actuated_joint
+from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.language.inputs import Inputs
+
+__all__ = ["with_recorded_past"]
+
+
+def with_recorded_past(
+    simulator: MujocoMechanism,
+    inputs: Inputs,
+    shape: Sequence[int],
+    chunk: slice,
+    tables: Tables,
+    memory: tuple[Tensor | None, ...],
+) -> tuple[Tensor | None, ...]:
+    """Returns the own states of servo effects at the start of segments.
+
+    Each effect gets the errors of its servo in every step since the rollout began: the recorded
+    goal minus the measured position. Without a record, or if the joint's position was not
+    measured, its state stays that of a rollout's beginning.
+
+    Args:
+        simulator: The simulator with its effects.
+        inputs: The segments.
+        shape: Shape of the batch and the segments, of numel N.
+        chunk: The simulations of these N that are computed, n.
+        tables: Parameters of the effects, ``(n,)`` or numbers.
+        memory: Own state of each servo effect as a rollout begins, ``(n,)``; ``None`` for effects
+            without a state.
+    """
+    effects = zip(simulator.servo_effects, memory, strict=True)
+    if inputs.recorded_actions is None or all(own is None for own in memory):
+        return memory
+    rollout, start = (
+        value.expand(*shape).reshape(-1)[chunk] for value in (inputs.rollout, inputs.start)
+    )
+    result = []
+    for (place, effect, actuator), own in effects:
+        errors = None if own is None else _errors(simulator, inputs, actuator)
+        if own is None or errors is None:
+            result.append(own)
+            continue
+        values, state = tables.effects[place], own
+        for step in range(int(start.max())):
+            later = effect.next_memory(errors[step][rollout], values, state, inputs.time_step)
+            assert later is not None
+            state = torch.where(step < start, later, state)
+        result.append(state)
+    return tuple(result)
+
+
+def _errors(simulator: MujocoMechanism, inputs: Inputs, actuator: int) -> Tensor | None:
+    """Returns a position servo's recorded errors, ``(T, R)``, zero where nothing was measured."""
+    joint = actuated_joint(simulator.model, actuator)
+    address = None if joint is None else int(simulator.model.jnt_qposadr[joint])
+    names = [
+        component.channel.name
+        for component in simulator.components
+        if not component.is_velocity and component.address == address
+    ]
+    action = simulator.actions[actuator]
+    known = [name for name in names if name in inputs.channel_names]
+    if inputs.recorded_actions is None or inputs.recorded_readings is None or not known:
+        return None
+    position = inputs.recorded_readings[..., inputs.channel_names.index(known[0])]
+    goal = inputs.recorded_actions[..., inputs.action_names.index(action.name)]
+    # The engine evaluates errors at the starts of its steps, n in each step of the recording. The
+    # mean of a position there is (n − 1)/(2 n) of the way to the next measurement.
+    later = torch.cat((position[:, 1:], position[:, -1:]), dim=1)
+    share = 0.5 - 0.5 / simulator.num_substeps(inputs.time_step)
+    errors = goal.clamp(action.lower, action.upper) - torch.lerp(position, later, share)
+    return errors.nan_to_num(0.0).T.contiguous()
