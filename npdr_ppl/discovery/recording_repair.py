@@ -19,6 +19,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.remedies import Remedy, Shift, remedies, without_one
+from npdr_ppl.discovery.screening.encoder_resolution import count_of
 from npdr_ppl.discovery.search.base_fit import fit_base
 from npdr_ppl.discovery.search.prior_ends import with_widest_priors
 from npdr_ppl.discovery.settings import REPAIR
@@ -380,21 +381,35 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
     A share of the motion, in the windows with the largest residuals, does not count. A window that
     begins at an impact has a wrong initial state in any recording. A wrong unit, sign or time
     stamp shows in all windows in which the device moves.
+
+    Rounding changes the difference of two measurements by up to the encoder's resolution.
+    Residuals up to it are no misfit, and a channel that changes by less shows no unit and no sign:
+    its ratio is 0. An idle gripper would otherwise make every recording of its arm look wrong.
     """
     segments, fit = hypothesis.segments, hypothesis.fit
     names = segments.inputs.channel_names
     columns = [names.index(name) for name in segments.channel_names]
     residual = segments.observed - segments.simulate(fit.z[None], fit.offsets[None])[0]
     change = segments.observed - segments.inputs.initial_values[:, None, columns]
+    measured = segments.is_measured.expand(residual.shape)
+    resolution = residual.new_tensor(
+        [
+            count_of(segments.observed[..., c][measured[..., c]].numpy()) or 0.0
+            for c in range(residual.shape[-1])
+        ]
+    )
+    residual = (residual.abs() - resolution).clamp_min(0.0)
     residuals, changes = (
-        (values * segments.is_measured).double().square().sum(1) for values in (residual, change)
+        (values * measured).double().square().sum(1) for values in (residual, change)
     )  # (S, C)
+    is_still = (resolution > 0.0) & (changes.sum(0) <= measured.sum((0, 1)) * resolution**2)
     order = residuals.argsort(0, descending=True)
     residuals, changes = residuals.gather(0, order), changes.gather(0, order)
     # All windows count if nothing was measured to move.
     is_counted = changes.cumsum(0) >= REPAIR.disregarded_share * changes.sum(0)
     left, moved = ((values * is_counted).sum(0) for values in (residuals, changes))
     ratio = (left / moved.clamp_min(1e-24)).sqrt().clamp_max(10.0).nan_to_num(10.0)
+    ratio = ratio.masked_fill(is_still, 0.0)
     return dict(zip(segments.channel_names, ratio.tolist(), strict=True))
 
 

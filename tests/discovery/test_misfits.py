@@ -32,3 +32,18 @@ def test_one_window_with_a_wrong_initial_state_does_not_count():
     # The window from row 30 on gets a wrong initial state; with it, 0.17 and 0.26 are left.
     torn[0][29:33] += np.array([1.0, 0.0])
     assert max(misfits(dataclasses.replace(rollouts, readings=tuple(torn))).values()) < 0.1
+
+
+def test_a_channel_that_moves_by_no_more_than_its_resolution_says_nothing():
+    rollouts = swinging(steps=240)
+    column = rollouts.channel_names.index("velocity")
+    count = 1e-2
+    idle = [values.copy() for values in rollouts.readings]
+    for values in idle:
+        values[:, column] = count * (np.arange(len(values)) // 40 % 2)
+    assert misfits(dataclasses.replace(rollouts, readings=tuple(idle)))["velocity"] == 0.0
+    # One that moves by ten times as much while the simulation does not is not explained.
+    for values in idle:
+        values[:, column] *= np.where(np.arange(len(values)) % 7 == 0, 10.0, 1.0)
+    found = misfits(dataclasses.replace(rollouts, readings=tuple(idle)))
+    assert found["velocity"] > 0.3
