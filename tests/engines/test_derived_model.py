@@ -92,7 +92,7 @@ def test_moving_masses_positive_friction_and_gains_are_varied(arm):
     expected = {
         "upper_mass": ("body upper mass_and_inertia", "kg", 0.8, 0.56, 1.04),
         "hand_mass": ("body hand mass_and_inertia", "kg", 0.3, 0.21, 0.39),
-        "elbow_frictionloss": ("joint elbow frictionloss", "N m", 0.05, 0.0, 0.3),
+        "elbow_frictionloss": ("joint elbow frictionloss", "N m", 0.05, 0.0, 0.5),
         "shoulder_armature": ("joint shoulder armature", "kg m²", 0.02, 0.01, 0.03),
         "shoulder_servo_kp": ("actuator shoulder_servo kp", "N m/rad", 40.0, *gains(40.0)),
         "shoulder_servo_kv": ("actuator shoulder_servo kv", "N m s/rad", 2.0, *gains(2.0)),

@@ -41,9 +41,9 @@ prior are within a factor of 19. These gains are often tuned until a simulation 
 measured: the kp of 998 N m/rad in the file of the SO-101 is 93 times that of its wrist, and 3
 standard deviations away."""
 
-FRICTION_RANGE = (0.0, 6.0)
+FRICTION_RANGE = (0.0, 10.0)
 """Prior of joint damping and friction loss as factors on the file's values. Both are rarely
-measured. Dry friction of two joints of the SO-101 is 2 and 5 times that of its file."""
+measured. Dry friction of four joints of the SO-101 is 2 to 8 times that of its file."""
 
 ROTOR_RANGE = (0.0, 10.0)
 """Prior of an armature of a URDF file, which cannot state any, as factors on a typical value: the
