@@ -3,16 +3,20 @@
     python benchmarks/planning.py --num 60 --out planning.jsonl
     python benchmarks/planning.py --summary planning.jsonl
 
-A case is one rollout of a rig of :mod:`hidden_rigs`, with one effect hidden whose strength is a
-part of the rig's typical size. It counts if the verdict of ``discover`` is ``ambiguous``, the
-hidden effect is among the causes that are left, and so is one that a recording of the rig can tell
-from it. Then one recording is planned, played on the rig,
-and ``discover`` gets both. So does a random recording within the same limits: the first random
-excitation of the search that keeps them. The limits are the rig's greatest commands, twice the
-positions, velocities and length of the first rollout, three times its bandwidth, and any pose from
-which the rig's rollouts are let go. Told apart means that no such cause is left: the verdict names
-the hidden effect or what no recording tells from it, or only these are left. Rows are written as
-they come, and a run given again continues.
+A case begins with the first half of one rollout of a rig of :mod:`hidden_rigs`, with one effect
+hidden whose strength is a part of the rig's typical size. It counts if the verdict of ``discover``
+is ``ambiguous``, the hidden effect is among the causes that are left, and so is one that a
+recording of the rig can tell from it. Then one recording is planned, with as many rollouts as
+:func:`npdr_ppl.planning.plan_recording` chooses, and played on the rig. ``discover`` gets it with
+the first one. The same is done with as many random rollouts within the same limits: the first
+random excitations of the search that keep them. The limits are the rig's greatest commands, twice
+the positions and speeds of its usual recordings, twice the length of the first one and three times
+its bandwidth, and any pose from which the rig's rollouts are let go.
+
+Told apart means that no such cause is left: the verdict names the hidden effect or what no
+recording tells from it, or only these are left. A case is undecidable if the plan itself predicts
+a chance below a half. Rows are written as they come, and a run given again continues. Numbers
+below 100 are for tuning.
 """
 
 import argparse
@@ -26,6 +30,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from discovery_rows import has_all, right_sets
 from hidden_rigs import RIGS, Case, make_case, places, play
@@ -39,14 +44,20 @@ from npdr_ppl.rollouts import Rollouts
 FIRST_SEED = 2000
 """Seed of the first cases; those of the blind benchmark end before it."""
 
-TIMES_RANGE, TIMES_BAND, TIMES_LONGER = 2.0, 3.0, 2.0
-"""Limits as multiples of the first recording's positions and velocities, and of its bandwidth and
-length."""
+FIRST_SHARE = 0.5
+"""Share of a rollout that is recorded first: short recordings are ambiguous more often."""
+
+TIMES_RANGE, TIMES_BAND = 2.0, 3.0
+"""Limits as multiples of the positions and velocities of the rig's usual recordings, and of its
+bandwidth."""
+
+UNDECIDABLE = 0.5
+"""Predicted chance of the right name below which a case cannot be decided within the limits."""
 
 NAMED = 0.05
 """Probability from which a cause is left, as in the verdict."""
 
-STRENGTHS = (0.05, 0.1, 0.2)
+STRENGTHS = (0.02, 0.05, 0.1, 0.2)
 """Multiples of an effect's typical size, in turn: weak effects are ambiguous more often."""
 
 
@@ -67,14 +78,15 @@ class Task:
     seed: int
 
 
-def tasks(rigs: list[str]) -> Iterator[Task]:
-    """Yields cases without end: rigs and effects in turn, then other strengths and seeds."""
-    for number in itertools.count():
-        for place in range(max(len(places(rig, "one")) for rig in rigs)):
-            for rig in rigs:
-                if place < len(places(rig, "one")):
-                    strength = STRENGTHS[(place + number) % len(STRENGTHS)]
-                    yield Task(rig, place, strength, FIRST_SEED + number)
+def tasks(rigs: list[str], first: int) -> Iterator[Task]:
+    """Yields cases without end: rigs and effects in random order, then those of other seeds."""
+    for number in itertools.count(first):
+        seed = FIRST_SEED + number
+        places_of = [(rig, place) for rig in rigs for place in range(len(places(rig, "one")))]
+        generator = np.random.default_rng(seed)
+        for index in generator.permutation(len(places_of)):
+            rig, place = places_of[index]
+            yield Task(rig, place, float(generator.choice(STRENGTHS)), seed)
 
 
 def judge(task: Task, rounds: int) -> dict[str, Any]:
@@ -85,7 +97,7 @@ def judge(task: Task, rounds: int) -> dict[str, Any]:
     try:
         case = make_case(task.rig, "one", chosen, strength=task.strength, seed=task.seed)
         row |= {"truth": list(case.names), "alternatives": [list(a) for a in case.alternatives]}
-        first = case.fit[[0]]
+        first = _first(case, task)
         found = npdr.discover(case.model, first, seed=task.seed, progress=False)
         row |= {"verdict": found.verdict, "found": _names(found)}
         row |= {"discover_seconds": time.monotonic() - begin}
@@ -112,11 +124,41 @@ def _planned(
         "plan_seconds": time.monotonic() - begin,
     }
     for kind, recording in (("planned", plan.recording), ("random", plan.random)):
-        start = recording.readings[0][0]
-        recorded = play(case, recording.actions[0], start, seed=task.seed)
+        recorded = _played(case, recording, 100 * task.seed + 50 * (kind == "random"))
+        begin = time.monotonic()
         row[kind] = _told(case, first.concatenate(recorded), task)
-        row[kind]["excess"] = _excess(plan, recorded)
+        row[kind] |= {"excess": _excess(plan, recorded), "seconds": time.monotonic() - begin}
     return row
+
+
+def _first(case: Case, task: Task) -> Rollouts:
+    """Returns the first half of a rollout, from rest or let go elsewhere in turn."""
+    whole = case.fit[[task.place % 2]]
+    num = round(FIRST_SHARE * whole.lengths[0])
+    return _like(whole, [whole.readings[0][: num + 1]], [whole.actions[0][:num]])
+
+
+def _played(case: Case, planned: Rollouts, seed: int) -> Rollouts:
+    """Returns what the rig measures while it plays the rollouts of a plan."""
+    played = [
+        play(case, commands, readings[0], seed=seed + k)
+        for k, (commands, readings) in enumerate(
+            zip(planned.actions, planned.readings, strict=True)
+        )
+    ]
+    return played[0].concatenate(*played[1:])
+
+
+def _like(rollouts: Rollouts, readings: list[Any], actions: list[Any]) -> Rollouts:
+    return Rollouts.from_arrays(
+        readings,
+        actions,
+        channel_names=rollouts.channel_names,
+        action_names=rollouts.action_names,
+        time_step=rollouts.time_step,
+        channel_units=rollouts.channel_units,
+        action_units=rollouts.action_units,
+    )
 
 
 def _limits(case: Case, known: Known) -> Limits:
@@ -124,11 +166,16 @@ def _limits(case: Case, known: Known) -> Limits:
     rig = RIGS[case.rig]
     found = default_limits(known.causes[0].simulator, known.recorded)
     spread = dict(zip(rig.layout.positions, rig.start_spread, strict=True))
+    usual = np.abs(np.concatenate(case.fit.readings)).max(0)
+    greatest = {
+        name: TIMES_RANGE * max(float(value), spread.get(name, 0.0))
+        for name, value in zip(case.fit.channel_names, usual, strict=True)
+    }
     channels = {
         name: replace(
             channel,
-            min=-TIMES_RANGE * max(-channel.min, channel.max, spread.get(name, 0.0)),
-            max=TIMES_RANGE * max(-channel.min, channel.max, spread.get(name, 0.0)),
+            min=-greatest[name],
+            max=greatest[name],
             start_min=-spread.get(name, 0.0),
             start_max=spread.get(name, 0.0),
         )
@@ -138,11 +185,10 @@ def _limits(case: Case, known: Known) -> Limits:
         name: ActionLimits(-limit, limit)
         for name, limit in zip(rig.layout.actions, rig.limits, strict=True)
     }
-    bandwidth = TIMES_BAND * rig.band.upper
     return replace(
         found,
-        duration=TIMES_LONGER * rig.duration,
-        bandwidth=bandwidth,
+        duration=rig.duration,
+        bandwidth=TIMES_BAND * rig.band.upper,
         actions=actions,
         channels=channels,
     )
@@ -169,6 +215,7 @@ def _told(case: Case, rollouts: Rollouts, task: Task) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "found": _names(found),
+        "left": [{n: p for n, p in f.alternatives.items() if p >= NAMED} for f in found.effects],
         "is_right": is_right,
         "is_wrong": found.verdict == "named" and not is_right,
         "reason": found.reason,
@@ -178,8 +225,9 @@ def _told(case: Case, rollouts: Rollouts, task: Task) -> dict[str, Any]:
 def _excess(plan: Plan, recorded: Rollouts) -> float:
     """Returns the greatest ratio of a measured value to its limit, less one."""
     worst = -1.0
+    every = np.concatenate(recorded.readings)
     for k, channel in enumerate(plan.limits.channels.values()):
-        values = recorded.readings[0][:, k]
+        values = every[:, k]
         middle, half = 0.5 * (channel.max + channel.min), 0.5 * (channel.max - channel.min)
         if math.isfinite(half):
             worst = max(worst, float(abs(values - middle).max()) / half - 1.0)
@@ -199,24 +247,42 @@ def is_ambiguous(row: dict[str, Any]) -> bool:
     return any(are_right) and not all(are_right)
 
 
+def is_decidable(row: dict[str, Any]) -> bool:
+    """Returns whether the plan itself expects that its recording names the cause."""
+    return row["plan"]["outlook"]["chance_of_the_right_name"] >= UNDECIDABLE
+
+
 def print_summary(path: Path) -> None:
     """Prints how many cases each recording tells apart."""
     rows = [json.loads(line) for line in path.read_text().splitlines()]
-    used = [row for row in rows if is_ambiguous(row)]
+    used = [row for row in rows if is_ambiguous(row) and "random" in row]
     print(f"{len(rows)} cases, {len(used)} ambiguous with the hidden effect among the causes")
-    print("| rig | ambiguous | planned tells apart | random tells apart | wrong names |")
-    print("|---|---|---|---|---|")
-    for rig in (*sorted({row["rig"] for row in used}), "all"):
-        own = [row for row in used if rig in ("all", row["rig"])]
-        planned, random = (sum(r[k]["is_right"] for r in own) for k in ("planned", "random"))
-        wrong = [sum(r[k]["is_wrong"] for r in own) for k in ("planned", "random")]
-        print(
-            f"| {rig} | {len(own)} | {planned} ({planned / max(len(own), 1):.0%}) | "
-            f"{random} ({random / max(len(own), 1):.0%}) | {wrong[0]}, {wrong[1]} |"
-        )
-    seconds = sorted(row["plan_seconds"] for row in used)
-    if seconds:
-        print(f"planning: median {seconds[len(seconds) // 2]:.0f} s, most {seconds[-1]:.0f} s")
+    columns = "planned tells apart", "random tells apart", "planned predicts", "random predicts"
+    print("| cases | number | " + " | ".join((*columns, "wrong names")) + " |")
+    print("|---" * 7 + "|")
+    groups = {
+        rig: [r for r in used if r["rig"] == rig] for rig in sorted({r["rig"] for r in used})
+    }
+    groups |= {"all": used, "decidable": [row for row in used if is_decidable(row)]}
+    for name, own in groups.items():
+        if own:
+            told = [_share([r[k]["is_right"] for r in own]) for k in ("planned", "random")]
+            predicted = [
+                f"{np.mean([r['plan']['outlook'][key] for r in own]):.0%}"
+                for key in ("chance_of_the_right_name", "random_chance_of_the_right_name")
+            ]
+            wrong = ", ".join(
+                str(sum(r[k]["is_wrong"] for r in own)) for k in ("planned", "random")
+            )
+            print("| " + " | ".join((name, str(len(own)), *told, *predicted, wrong)) + " |")
+    for key, what in (("plan_seconds", "planning"), ("discover_seconds", "the first discovery")):
+        seconds = sorted(row[key] for row in used)
+        if seconds:
+            print(f"{what}: median {seconds[len(seconds) // 2]:.0f} s, most {seconds[-1]:.0f} s")
+
+
+def _share(flags: list[bool]) -> str:
+    return f"{sum(flags)} ({np.mean(flags):.0%})"
 
 
 def main() -> None:
@@ -225,6 +291,7 @@ def main() -> None:
     parser.add_argument("--rigs", default="pendulum,furuta,cart_pole,emps")
     parser.add_argument("--num", type=int, default=60, help="ambiguous cases to plan for")
     parser.add_argument("--rounds", type=int, default=30, help="batches of the search")
+    parser.add_argument("--first", type=int, default=100, help="number of the first cases")
     parser.add_argument("--most-seconds", type=float, default=math.inf)
     parser.add_argument("--out", type=Path, default=Path("planning.jsonl"))
     parser.add_argument("--summary", type=Path, help="only summarise this file")
@@ -237,7 +304,7 @@ def main() -> None:
     rows = [json.loads(line) for line in lines]
     done = {Task(r["rig"], r["place"], r["strength"], r["seed"]) for r in rows}
     begin, num = time.monotonic(), sum(map(is_ambiguous, rows))
-    for task in tasks(arguments.rigs.split(",")):
+    for task in tasks(arguments.rigs.split(","), arguments.first):
         if num >= arguments.num or time.monotonic() - begin > arguments.most_seconds:
             break
         if task in done:
@@ -247,7 +314,7 @@ def main() -> None:
         with arguments.out.open("a") as file:
             file.write(json.dumps(row) + "\n")
         told = {k: row[k]["verdict"] for k in ("planned", "random") if k in row}
-        print(f"{task} {row.get('truth')} {row.get('verdict', row.get('error'))} {told}")
+        print(task, row.get("truth"), row.get("verdict", row.get("error")), told, flush=True)
     print_summary(arguments.out)
 
 

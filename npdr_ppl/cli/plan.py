@@ -36,6 +36,14 @@ def plan(
         bool,
         typer.Option("--print-limits", help="Print the limits as TOML, to edit them, and end."),
     ] = False,
+    rollouts: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Rollouts of the recording. Without it, one, or as many as tell several causes "
+            "apart, at most 6.",
+        ),
+    ] = None,
     effect: EffectOption = None,
     batches: Annotated[
         int, typer.Option(min=1, help="Batches of excitations that are tried.")
@@ -75,7 +83,9 @@ def plan(
         causes_of_run(Path(words[0]), chosen) if len(words) == 2 else causes_of_prior(chosen, seed)
     )
     simulator = known.causes[0].simulator
-    defaults = default_limits(simulator, known.recorded)
+    defaults = default_limits(
+        simulator, known.recorded, time_step=known.time_step, noise=known.noise
+    )
     if print_limits:
         channels = (*simulator.sensors, *simulator.actions)
         typer.echo(defaults.toml({c.name: c.unit for c in channels}), nl=False)
@@ -91,6 +101,7 @@ def plan(
         found = plan_recording(
             known,
             allowed,
+            rollouts=rollouts,
             rounds=batches,
             time_limit=search_time,
             seed=seed,

@@ -417,26 +417,45 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
         figures = (values["before"], values["after"], values["random"])
         table.add_row(*map(escape, names), *(format(figure, digits) for figure in figures))
     console.print(table)
-    console.print(_told_by_plan(found))
-    start = ", ".join(f"{name} {value:.4g}" for name, value in found["start"].items())
-    console.print(f"Start at rest at {start}.", highlight=False)
+    console.print(_told_by_plan(found), highlight=False)
+    for index, values in enumerate(found["starts"]):
+        start = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+        which = f"rollout {index}" if len(found["starts"]) > 1 else "it"
+        console.print(f"Start {which} at rest at {start}.", highlight=False)
     if found["has_stopped"]:
         console.print("The time limit ended the search; a longer --search-time may find more.")
-    console.print(f"The commands for {found['duration']:.4g} s are in {out}", highlight=False)
+    rollouts = f"{found['rollouts']} rollouts of " if found["rollouts"] > 1 else ""
+    console.print(
+        f"The commands for {rollouts}{found['duration']:.4g} s are in {out}", highlight=False
+    )
 
 
 def _told_by_plan(found: Mapping[str, Any]) -> str:
-    """Returns the result in a sentence."""
-    if not found["separations"]:
+    """Returns the result in a sentence or more."""
+    outlook = found["outlook"]
+    if outlook is None:
         return f"Expected information: {found['information']:.1f} nats."
-    close = [pair for pair in found["separations"] if pair["after"] < found["useful_separation"]]
-    if not close:
-        return "The recording is expected to tell all of these causes apart."
-    pairs = "; ".join(f"{pair['one']} and {pair['other']}" for pair in close)
-    return (
-        f"Below {found['useful_separation']:g} deviations, and perhaps not told apart: "
-        f"{escape(pairs)}."
+    right, wrong, random = (
+        f"{outlook[key]:.0%}"
+        for key in (
+            "chance_of_the_right_name",
+            "chance_of_a_wrong_name",
+            "random_chance_of_the_right_name",
+        )
     )
+    told = (
+        f"With this recording, npdr discover is expected to name the right cause in {right} of "
+        f"such cases, and a wrong one in {wrong}; with random commands the right one in {random}."
+    )
+    wanted, needed = outlook["wanted_chance"], outlook["needed_rollouts"]
+    if outlook["chance_of_the_right_name"] >= wanted:
+        return told
+    if needed is None:
+        return (
+            f"{told} Within these limits, even {outlook['most_needed_rollouts']} rollouts do not "
+            f"suffice for {wanted:.0%}: allow more position, speed, command or bandwidth."
+        )
+    return f"{told} For {wanted:.0%}, about {needed} rollouts are needed: --rollouts {needed}."
 
 
 def _console() -> Console:

@@ -67,6 +67,8 @@ class Known:
         recorded: The ranges of the recording so far; ``None`` without one.
         share: Effective number of independent measurements as a share of all.
         segment_length: Steps of a segment; ``None`` for the default.
+        time_step: Seconds per step of the recording so far; ``None`` if it is not known.
+        noise: Standard deviation of the measurements so far, by channel; empty if not known.
         is_prior: Whether the causes are draws of the prior.
     """
 
@@ -75,6 +77,8 @@ class Known:
     recorded: Mapping[str, Any] | None = None
     share: float = 1.0
     segment_length: int | None = None
+    time_step: float | None = None
+    noise: Mapping[str, float] = field(default_factory=dict)
     is_prior: bool = field(default=False)
 
 
@@ -115,7 +119,13 @@ def causes_of_run(run: Path, model: Callable[..., Any]) -> Known:
     if not causes or separations.shape != (len(causes), len(causes)):
         raise DataError(f"{run} keeps causes and separations that do not fit together.")
     return Known(
-        causes, separations, record, record["independent_share"], record["segment_length"]
+        causes,
+        separations,
+        record,
+        record["independent_share"],
+        record["segment_length"],
+        record["time_step"],
+        record["noise"],
     )
 
 
@@ -172,7 +182,39 @@ def _causes_of_fit(run: Path, model: Callable[..., Any]) -> Known:
     if not bool(z.isfinite().all()):
         raise DataError(f"{run}: a posterior mean lies outside the priors of the model.")
     cause = Cause("the fitted model", revised, z, width.square().reciprocal().diag())
-    return Known((cause,), torch.zeros(1, 1))
+    prepared: Mapping[str, Any] = record.get("preparation") or {}
+    return Known(
+        (cause,),
+        torch.zeros(1, 1),
+        share=float(prepared.get("independent_share") or 1.0),
+        segment_length=prepared.get("segment_length"),
+        time_step=found.time_step,
+        noise=_noise(prepared, revised, run),
+    )
+
+
+def _noise(prepared: Mapping[str, Any], model: Model, run: Path) -> Mapping[str, float]:
+    """Returns the noise that a fit estimated, or that its model declares; empty if neither."""
+    found = prepared.get("noise")
+    if found is None:
+        return _declared_noise(model)
+    if not isinstance(found, Mapping) or not all(
+        isinstance(value, int | float) and value > 0.0 for value in found.values()
+    ):
+        raise DataError(f"{run} keeps a noise that is not a positive number for each channel.")
+    return {str(name): float(value) for name, value in found.items()}
+
+
+def _declared_noise(model: Model) -> Mapping[str, float]:
+    """Returns the noise that a model declares, by sensor; empty if it declares no normal noise."""
+    box = only_simulator(model)[0]
+    noise, names = box.noise, [sensor.name for sensor in box.simulator.sensors]
+    if noise is None or callable(noise):
+        return {}
+    values = noise if isinstance(noise, Mapping) else dict.fromkeys(names, noise)
+    return {
+        name: float(torch.as_tensor(value).double().flatten()[0]) for name, value in values.items()
+    }
 
 
 def _revised(

@@ -13,7 +13,7 @@ parameters of one cause is ½ log det(P⁻¹ (Jᵀ C⁻¹ J + P)).
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +34,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.states import estimate_states
 
-__all__ = ["Judge", "Played", "information_gain"]
+__all__ = ["Judge", "Played", "Shown", "information_gain"]
 
 Array = NDArray[np.float64]
 
@@ -173,16 +173,13 @@ class Judge:
                 worst = np.maximum(worst, np.nan_to_num(ratio, nan=math.inf) - 1.0)
         return np.where(np.isfinite(played.readings).all((0, 2, 3)), worst, math.inf)
 
-    def separations(self, played: Played) -> Array:
-        """Returns the squared separations along each candidate alone, ``(E, n, n)``.
-
-        Row a and column b have the distance from what a simulates to what b can imitate.
-        """
-        num = len(self.known.causes)
-        result = np.zeros((len(played.commands), num, num))
-        for a, b in itertools.permutations(range(num), 2):
-            result[:, a, b] = self._separation(played, a, b, every=1).sum(0)
-        return result
+    def shown(self, played: Played) -> "Shown":
+        """Returns what candidates would show of every pair of causes, in both directions."""
+        pairs = itertools.permutations(range(len(self.known.causes)), 2)
+        return Shown(
+            {(a, b): self._blocks(played, a, b, every=1) for a, b in pairs},
+            [cause.precision for cause in self.known.causes],
+        )
 
     def certainty(self, played: Played) -> Array:
         """Returns how well each candidate tells the causes apart, ``(E,)``; more is better.
@@ -214,8 +211,12 @@ class Judge:
             cause: Index of the cause.
             every: Each how many-th segment is simulated; it stands for the others.
         """
+        return self.information(played, cause, every=every) + self.known.causes[cause].precision
+
+    def information(self, played: Played, cause: int, *, every: int = 1) -> Tensor:
+        """Returns what each candidate adds to a cause's precision, ``(E, d, d)``."""
         products = every * self._products(played, cause, cause, every=every).sum(1)
-        return self.known.share * products[:, :-1, :-1] + self.known.causes[cause].precision
+        return self.known.share * products[:, :-1, :-1]
 
     def gains(self, played: Played) -> Array:
         """Returns the gain of information in nats, averaged over the causes, ``(E,)``."""
@@ -231,20 +232,15 @@ class Judge:
     def _separation(self, played: Played, a: int, b: int, *, every: int) -> Array:
         """Returns the squared separation of b from a, ``(blocks, E)``, by block of segments."""
         try:
-            products = self.known.share * self._products(played, a, b, every=every)
+            products = self._blocks(played, a, b, every=every)
         except NpdrError:
             return np.full((1, len(played.commands)), -math.inf)
-        whole = every * products.sum(1)
-        information, score = whole[:, :-1, :-1], whole[:, :-1, -1]
-        precision = self.known.causes[b].precision
-        shift = torch.linalg.solve(information + precision, score)
-        # The parameters move, and the difference r becomes r − J shift.
-        moved = torch.cat((-shift, torch.ones_like(shift[:, :1])), dim=-1)
-        left = torch.einsum("ei,esij,ej->se", moved, products, moved)
-        # Moved parameters fit the recordings so far less well, nearly evenly.
-        before = torch.einsum("ei,ij,ej->e", shift, precision, shift)
-        left = left + before / (every * len(left))
-        return block_sums(left.clamp_min(0.0).nan_to_num(-math.inf)).numpy()
+        return _apart(products, self.known.causes[b].precision, every).mT.numpy()
+
+    def _blocks(self, played: Played, a: int, b: int, *, every: int) -> Tensor:
+        """Returns the products by block of segments, ``(E, blocks, d + 1, d + 1)``."""
+        products = self.known.share * self._products(played, a, b, every=every)
+        return block_sums(products.transpose(0, 1)).transpose(0, 1)
 
     def _products(self, played: Played, a: int, b: int, *, every: int) -> Tensor:
         """Returns (J r)ᵀ C⁻¹ (J r) of segments of each candidate, ``(E, S, d + 1, d + 1)``.
@@ -346,6 +342,49 @@ class Judge:
             return np.full((*inputs.actions.shape[:2], len(self.channels)), math.nan)
         simulated = simulated.reshape(inputs.num_segments, inputs.num_steps, len(names)).double()
         return simulated[..., [names.index(name) for name in self.channels]].numpy()
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What candidates would show of every pair of causes, several candidates together included.
+
+    Attributes:
+        products: (J r)ᵀ C⁻¹ (J r) by pair (a, b) and block, ``(E, blocks, d + 1, d + 1)``.
+        precisions: Precision of each cause's coordinates after the recordings so far.
+    """
+
+    products: Mapping[tuple[int, int], Tensor]
+    precisions: Sequence[Tensor]
+
+    def squares(self, chosen: Sequence[int]) -> dict[tuple[int, int], Array]:
+        """Returns the squared separations along several candidates together, by pair and block.
+
+        One set of parameters must fit all of them. A candidate may be chosen several times.
+        """
+        return {
+            (a, b): _apart(found[list(chosen)].flatten(0, 1)[None], self.precisions[b])[0].numpy()
+            for (a, b), found in self.products.items()
+        }
+
+
+def _apart(products: Tensor, precision: Tensor, every: int = 1) -> Tensor:
+    """Returns the squared separations after the refit, ``(E, blocks)``.
+
+    Args:
+        products: Products by block, ``(E, blocks, d + 1, d + 1)``.
+        precision: Precision of the coordinates that are refitted, ``(d, d)``.
+        every: Number of segments for which each one stands.
+    """
+    whole = every * products.sum(1)
+    information, score = whole[:, :-1, :-1], whole[:, :-1, -1]
+    shift = torch.linalg.solve(information + precision, score)
+    # The parameters move, and the difference r becomes r − J shift.
+    moved = torch.cat((-shift, torch.ones_like(shift[:, :1])), dim=-1)
+    left = torch.einsum("ei,esij,ej->es", moved, products, moved)
+    # Moved parameters fit the recordings so far less well, nearly evenly.
+    before = torch.einsum("ei,ij,ej->e", shift, precision, shift)
+    left = left + before[:, None] / (every * left.shape[1])
+    return left.clamp_min(0.0).nan_to_num(-math.inf)
 
 
 def information_gain(before: Tensor, after: Tensor) -> Tensor:

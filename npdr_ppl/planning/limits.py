@@ -112,27 +112,43 @@ class Limits:
         return "\n".join([*lines, ""])
 
 
-def default_limits(simulator: Simulator, recorded: Mapping[str, Any] | None) -> Limits:
+def default_limits(
+    simulator: Simulator,
+    recorded: Mapping[str, Any] | None,
+    *,
+    time_step: float | None = None,
+    noise: Mapping[str, float] | None = None,
+) -> Limits:
     """Returns limits that the recording kept, or, without one, those that the model declares.
 
     Args:
         simulator: The model's simulator.
         recorded: ``surviving_causes`` of a discovery; ``None`` without a recording.
+        time_step: Seconds per step of a fitted recording; ``None`` for the model's.
+        noise: Standard deviation of the channels that were measured in it; empty or ``None`` for
+            the usual noise of all sensors.
 
     Raises:
         DataError: A command has no limits.
     """
     if recorded is not None:
         return _of_recording(simulator, recorded)
+    channels = {s.name: _declared(simulator, s) for s in simulator.sensors}
+    if noise:
+        channels = {
+            name: replace(channel, noise=noise[name])
+            for name, channel in channels.items()
+            if name in noise
+        }
     return Limits(
         PLANNING.prior_seconds,
         PLANNING.prior_bandwidth,
-        simulator.time_step,
+        time_step or simulator.time_step,
         {
             a.name: ActionLimits(a.lower, a.upper, start=_nearest_zero(a))
             for a in simulator.actions
         },
-        {s.name: _declared(simulator, s) for s in simulator.sensors},
+        channels,
     )
 
 

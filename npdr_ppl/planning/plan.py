@@ -1,19 +1,25 @@
 """Plans the next recording."""
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.errors import DataError
 from npdr_ppl.planning.causes import Known, prior_of
-from npdr_ppl.planning.excitations import Excitations
-from npdr_ppl.planning.judging import Judge, Played, information_gain
+from npdr_ppl.planning.chances import Chance
+from npdr_ppl.planning.excitations import Candidate, Excitations
+from npdr_ppl.planning.judging import Judge, Played, Shown, information_gain
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.search import Found, search_excitations
+from npdr_ppl.planning.selection import chance_of, rollouts_that_inform, rollouts_that_separate
+from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
@@ -31,7 +37,7 @@ class Pair:
         other: Name of another one.
         before: Their separation along the recordings so far.
         after: Their separation along these and the planned one.
-        random: The same with a random recording within the same limits.
+        random: The same with as many random rollouts within the same limits.
     """
 
     one: str
@@ -59,21 +65,50 @@ class Width:
 
 
 @dataclass(frozen=True)
+class Outlook:
+    """What a search with all recordings is expected to say, if there are several causes.
+
+    Attributes:
+        planned: The chance that it names the right cause, and a wrong one, after the plan.
+        random: The same after as many random rollouts.
+        needed: Number of such rollouts after which the chance is at least 0.9; ``None`` if more
+            than 60 would be needed.
+    """
+
+    planned: Chance
+    random: Chance
+    needed: int | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns JSON-serialisable values."""
+        return {
+            "chance_of_the_right_name": self.planned.right,
+            "chance_of_a_wrong_name": self.planned.wrong,
+            "random_chance_of_the_right_name": self.random.right,
+            "wanted_chance": PLANNING.wanted,
+            "needed_rollouts": self.needed,
+            "most_needed_rollouts": PLANNING.most_needed,
+        }
+
+
+@dataclass(frozen=True)
 class Plan:
     """The next recording.
 
     Attributes:
         recording: Commands, and what the likeliest cause predicts that is measured.
         pairs: Separations, if there are several causes.
+        outlook: What a search is expected to say, if there are several causes.
         widths: Widths of the parameters, if there is one cause.
         information: Expected gain of information in nats, if there is one cause.
         limits: The limits.
         found: The course of the search.
-        random: A random recording within the same limits.
+        random: As many random rollouts within the same limits.
     """
 
     recording: Rollouts
     pairs: tuple[Pair, ...]
+    outlook: Outlook | None
     widths: tuple[Width, ...]
     information: float
     limits: Limits
@@ -87,20 +122,20 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
+        names = self.recording.channel_names
         return {
             "separations": [vars(pair) for pair in self.pairs],
             "smallest_separation": self.smallest if self.pairs else None,
             "useful_separation": EXPERIMENT.useful_separation,
+            "outlook": self.outlook.to_dict() if self.outlook else None,
             "widths": [vars(width) for width in self.widths],
             "information": self.information if self.widths else None,
+            "rollouts": len(self.recording),
             "duration": self.limits.duration,
-            "start": dict(
-                zip(
-                    self.recording.channel_names,
-                    self.recording.readings[0][0].tolist(),
-                    strict=True,
-                )
-            ),
+            "starts": [
+                dict(zip(names, readings[0].tolist(), strict=True))
+                for readings in self.recording.readings
+            ],
             "num_judged": self.found.num_judged,
             "has_stopped": self.found.has_stopped,
         }
@@ -110,6 +145,7 @@ def plan_recording(
     known: Known,
     limits: Limits,
     *,
+    rollouts: int | None = None,
     rounds: int = 30,
     time_limit: float = math.inf,
     seed: int = 0,
@@ -125,6 +161,8 @@ def plan_recording(
         known: The causes, from :func:`~npdr_ppl.planning.causes.causes_of_run` or
             :func:`~npdr_ppl.planning.causes.causes_of_prior`.
         limits: What the robot may do.
+        rollouts: Number of rollouts. ``None`` plans one, or with several causes as many as are
+            expected to be needed, at most 6.
         rounds: Number of batches of the search.
         time_limit: Seconds after which no further batch begins. The result then depends on the
             speed of the machine.
@@ -134,11 +172,7 @@ def plan_recording(
     Raises:
         DataError: No excitation keeps the limits in all causes, or a channel has no noise.
     """
-    for name, channel in limits.channels.items():
-        if not channel.noise > 0.0:
-            raise DataError(f"{name} has no noise; write noise below [channels.{name}].")
-    if not limits.actions:
-        raise DataError("The model has no actions, so there are no commands to plan.")
+    _check(limits, rollouts)
     excitations = Excitations(limits, np.random.default_rng(seed))
     judge = Judge(known, limits, seed)
     separates = len(known.causes) > 1 and not known.is_prior
@@ -149,55 +183,141 @@ def plan_recording(
     found = search_excitations(
         excitations, judge, value_of, rounds=rounds, time_limit=time_limit, progress=progress
     )
-    if found.best is None and found.first is not None:
+    if not found.pool:
+        raise _nothing_found(known, judge, found)
+    # All segments are judged now, so no more candidates than a batch has.
+    pool = found.pool[: max(1, judge.batch // 2)]
+    random = found.random[: max(1, judge.batch // 2)]
+    if not separates and rollouts is None:
+        pool, random = pool[:1], random[:1]
+    played = _played(excitations, judge, [*pool, *random])
+    if separates:
+        return _separating(known, judge, played, len(pool), rollouts, found)
+    return _informing(known, judge, played, len(pool), rollouts or 1, found)
+
+
+def _check(limits: Limits, rollouts: int | None) -> None:
+    """Raises a DataError if there is nothing to plan, or nothing to judge it by."""
+    for name, channel in limits.channels.items():
+        if not channel.noise > 0.0:
+            raise DataError(f"{name} has no noise; write noise below [channels.{name}].")
+    if not limits.actions:
+        raise DataError("The model has no actions, so there are no commands to plan.")
+    if rollouts is not None and not 1 <= rollouts <= PLANNING.most_needed:
         raise DataError(
+            f"A plan has between 1 and {PLANNING.most_needed} rollouts, not {rollouts}."
+        )
+
+
+def _nothing_found(known: Known, judge: Judge, found: Found) -> DataError:
+    """Returns why no excitation was found."""
+    if found.num_judged:
+        return DataError(
             "The causes cannot be simulated in short segments of any excitation; the model may "
             "need smaller integration steps."
         )
-    if found.best is None or found.first is None:
-        raise DataError(
-            f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "
-            "limits; allow more position, speed or acceleration, or search longer."
-            + (f" A simulation failed: {judge.failure}" if judge.failure else "")
-        )
-    both = [found.best, found.first]
-    played = judge.played(
-        np.stack([excitations.commands(c) for c in both]),
-        np.stack([excitations.start(c) for c in both]),
+    return DataError(
+        f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "
+        "limits; allow more position, speed or acceleration, or search longer."
+        + (f" A simulation failed: {judge.failure}" if judge.failure else "")
     )
-    planned, random = (_recording(judge, played, k) for k in range(2))
-    if separates:
-        pairs = _pairs(known, judge.separations(played))
-        return Plan(planned, pairs, (), math.nan, limits, found, random)
-    widths, information = _widths(known, judge, played)
-    return Plan(planned, (), widths, information, limits, found, random)
 
 
-def _pairs(known: Known, squares: Array) -> tuple[Pair, ...]:
-    """Returns the separations of all pairs; of the two directions, the smaller one.
+def _separating(
+    known: Known, judge: Judge, played: Played, num_pool: int, rollouts: int | None, found: Found
+) -> Plan:
+    """Returns the plan that tells several causes apart.
 
     Args:
         known: The causes.
-        squares: Squared separations along the planned and the random recording, ``(2, n, n)``.
+        judge: Predicts what candidates would show.
+        played: The candidates to choose from, then random ones.
+        num_pool: Number of the candidates to choose from.
+        rollouts: Number of rollouts; ``None`` for as many as are needed.
+        found: The course of the search.
     """
-    root = np.sqrt(known.separations.square().numpy() + np.maximum(squares, 0.0))
-    result = []
-    for a, one in enumerate(known.causes):
-        for b in range(a + 1, len(known.causes)):
-            before = min(float(known.separations[a, b]), float(known.separations[b, a]))
-            after, random = np.minimum(root[:, a, b], root[:, b, a]).tolist()
-            result.append(Pair(one.name, known.causes[b].name, before, after, random))
-    return tuple(result)
+    shown, pool = judge.shown(played), range(num_pool)
+    allowed = rollouts or PLANNING.most_rollouts
+    every = rollouts_that_separate(
+        known, shown, pool, least=rollouts or 1, most=max(allowed, PLANNING.most_needed)
+    )
+    chosen = every[:allowed]
+    random = _in_turn(range(num_pool, len(played.commands)), len(chosen))
+    is_enough = chance_of(known, shown, every).right >= PLANNING.wanted
+    outlook = Outlook(
+        chance_of(known, shown, chosen),
+        chance_of(known, shown, random),
+        len(every) if is_enough else None,
+    )
+    return Plan(
+        _recording(judge, played, chosen),
+        _pairs(known, shown, chosen, random),
+        outlook,
+        (),
+        math.nan,
+        judge.limits,
+        found,
+        _recording(judge, played, random),
+    )
 
 
-def _widths(known: Known, judge: Judge, played: Played) -> tuple[tuple[Width, ...], float]:
+def _informing(
+    known: Known, judge: Judge, played: Played, num_pool: int, rollouts: int, found: Found
+) -> Plan:
+    """Returns the plan that narrows parameters; see :func:`_separating`."""
+    information = [judge.information(played, k) for k in range(len(known.causes))]
+    chosen = rollouts_that_inform(known, information, range(num_pool), rollouts)
+    random = _in_turn(range(num_pool, len(played.commands)), len(chosen))
+    widths, gain = _widths(known, information, chosen, random)
+    return Plan(
+        _recording(judge, played, chosen),
+        (),
+        None,
+        widths,
+        gain,
+        judge.limits,
+        found,
+        _recording(judge, played, random),
+    )
+
+
+def _in_turn(members: Sequence[int], number: int) -> list[int]:
+    """Returns a number of members, in turn."""
+    return [members[k % len(members)] for k in range(number)]
+
+
+def _pairs(
+    known: Known, shown: Shown, chosen: Sequence[int], random: Sequence[int]
+) -> tuple[Pair, ...]:
+    """Returns the separations of all pairs; of the two directions, the smaller one."""
+    added = [shown.squares(part) for part in (chosen, random)]
+
+    def both(a: int, b: int) -> list[float]:
+        before = float(known.separations[a, b])
+        return [before, *(math.hypot(before, math.sqrt(s[a, b].sum())) for s in added)]
+
+    return tuple(
+        Pair(
+            known.causes[a].name,
+            known.causes[b].name,
+            *(min(pair) for pair in zip(both(a, b), both(b, a), strict=True)),
+        )
+        for a, b in itertools.combinations(range(len(known.causes)), 2)
+    )
+
+
+def _widths(
+    known: Known, information: Sequence[Tensor], chosen: Sequence[int], random: Sequence[int]
+) -> tuple[tuple[Width, ...], float]:
     """Returns the widths of the parameters and the information, averaged over the causes."""
-    before, after, gains = [], [], []
-    for index, cause in enumerate(known.causes):
-        precision = judge.precisions(played, index)
-        before.append(cause.precision.inverse().diagonal().sqrt().numpy())
-        after.append(precision.inverse().diagonal(dim1=-2, dim2=-1).sqrt().numpy())
-        gains.append(float(information_gain(cause.precision, precision)[0]))
+    widths, gains = [], []
+    for cause, added in zip(known.causes, information, strict=True):
+        every = [
+            cause.precision,
+            *(cause.precision + added[list(k)].sum(0) for k in (chosen, random)),
+        ]
+        widths.append([p.inverse().diagonal().sqrt().numpy() for p in every])
+        gains.append(float(information_gain(every[0], every[1])))
     prior = prior_of(known.causes[0].model)
     names = [
         site.name if width == 1 else f"{site.name}[{k}]"
@@ -205,24 +325,30 @@ def _widths(known: Known, judge: Judge, played: Played) -> tuple[tuple[Width, ..
         for width in (site.coordinates.stop - site.coordinates.start,)
         for k in range(width)
     ]
-    mean_before, mean_after = np.mean(before, axis=0), np.mean(after, axis=0)
-    widths = tuple(
-        Width(name, *map(float, (mean_before[k], mean_after[0, k], mean_after[1, k])))
-        for k, name in enumerate(names)
+    mean = np.mean(widths, axis=0)
+    return (
+        tuple(Width(name, *mean[:, k].tolist()) for k, name in enumerate(names)),
+        float(np.mean(gains)),
     )
-    return widths, float(np.mean(gains))
 
 
-def _recording(judge: Judge, played: Played, index: int) -> Rollouts:
-    """Returns the commands of a candidate with the measurements that the first cause predicts."""
+def _recording(judge: Judge, played: Played, chosen: Sequence[int]) -> Rollouts:
+    """Returns commands of candidates with the measurements that the first cause predicts."""
     simulator = judge.known.causes[0].simulator
     units = {c.name: c.unit for c in (*simulator.sensors, *simulator.actions)}
     return Rollouts.from_arrays(
-        [np.concatenate((played.start[index][None], played.readings[0, index]))],
-        [played.commands[index]],
+        [np.concatenate((played.start[k][None], played.readings[0, k])) for k in chosen],
+        [played.commands[k] for k in chosen],
         channel_names=judge.channels,
         action_names=judge.actions,
         time_step=judge.limits.time_step,
         channel_units=[units.get(name, "") for name in judge.channels],
         action_units=[units.get(name, "") for name in judge.actions],
+    )
+
+
+def _played(excitations: Excitations, judge: Judge, candidates: Sequence[Candidate]) -> Played:
+    return judge.played(
+        np.stack([excitations.commands(c) for c in candidates]),
+        np.stack([excitations.start(c) for c in candidates]),
     )

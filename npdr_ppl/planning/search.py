@@ -22,37 +22,38 @@ class Found:
     """The result of a search.
 
     Attributes:
-        best: The best candidate; ``None`` if none was within the limits.
-        value: Its value.
-        first: The first random candidate within the limits: one random recording.
+        pool: The best candidates, the best first, and the best random ones among them, which
+            differ more; none if none was within the limits.
+        random: The first random candidates within the limits: random recordings.
         num_judged: Number of candidates that were judged.
         has_stopped: Whether the time limit ended the search.
     """
 
-    best: Candidate | None
-    value: float
-    first: Candidate | None
+    pool: tuple[Candidate, ...]
+    random: tuple[Candidate, ...]
     num_judged: int
     has_stopped: bool
 
 
 class _Ranked:
-    """The best candidates so far, and the first one."""
+    """The best candidates so far, the best random ones, and the first ones."""
 
     def __init__(self) -> None:
         self.elites: list[tuple[float, Candidate]] = []
-        self.first: Candidate | None = None
+        self.varied: list[tuple[float, Candidate]] = []
+        self.first: list[Candidate] = []
         self.num_judged = 0
 
-    def add(self, candidates: list[Candidate], values: Array) -> bool:
+    def add(self, candidates: list[Candidate], values: Array, *, are_random: bool) -> bool:
         """Adds candidates; returns whether one is better than the best so far."""
         before = self.elites[0][0] if self.elites else -np.inf
-        if candidates and self.first is None:
-            self.first = candidates[0]
         self.num_judged += len(candidates)
         found = [(float(v), c) for v, c in zip(values, candidates, strict=True) if np.isfinite(v)]
         self.elites = sorted([*self.elites, *found], key=lambda pair: -pair[0])
         self.elites = self.elites[: PLANNING.elites]
+        if are_random:
+            self.first = [*self.first, *(c for _, c in found)][: PLANNING.most_rollouts]
+            self.varied = list(self.elites)
         return bool(self.elites) and self.elites[0][0] > before
 
 
@@ -93,10 +94,11 @@ def search_excitations(
         )
         candidates, played = _within_limits(excitations, judge, made)
         values = value_of(played) if candidates else np.zeros(0)
-        if not ranked.add(candidates, values) and not is_first:
+        if not ranked.add(candidates, values, are_random=is_first) and not is_first:
             step = max(PLANNING.least_step, PLANNING.shrink * step)
-    best = ranked.elites[0] if ranked.elites else (float("nan"), None)
-    return Found(best[1], best[0], ranked.first, ranked.num_judged, has_stopped)
+    pool = [candidate for _, candidate in ranked.elites]
+    pool += [c for _, c in ranked.varied if not any(c is kept for kept in pool)]
+    return Found(tuple(pool), tuple(ranked.first), ranked.num_judged, has_stopped)
 
 
 def _refined(

@@ -38,6 +38,16 @@ class PlanningSettings:
             are estimated.
         relative_noise: Standard deviation of a channel's noise as a share of its rated value, if
             nothing is known. An encoder of 4096 counts per turn has 0.0004 rad.
+        most_rollouts: Greatest number of rollouts that a plan has unless the user asks for more.
+            Six rollouts of 10 s are a minute of recording.
+        most_needed: Greatest number of rollouts up to which the number that would be needed is
+            told; more of 10 s each take over 10 minutes.
+        wanted: Chance of naming the right cause from which no further rollout is added; that with
+            which discovery itself names a cause.
+        least_likely: Probability of a cause that was stored as zero.
+        num_datasets: Number of simulated recordings from which the chance of naming is computed;
+            its standard error is at most 0.025.
+        num_resamplings: Number of resamplings of the evidence of each; discovery has 1000.
         most_seconds: Longest default duration in seconds.
         prior_seconds: Default duration without a recording.
         prior_bandwidth: Default bandwidth in Hz without a recording.
@@ -59,6 +69,12 @@ class PlanningSettings:
     num_draws: int = 5
     num_smoothed: int = 3
     relative_noise: float = 1e-3
+    most_rollouts: int = 6
+    most_needed: int = 60
+    wanted: float = 0.9
+    least_likely: float = 1e-6
+    num_datasets: int = 400
+    num_resamplings: int = 100
     most_seconds: float = 10.0
     prior_seconds: float = 5.0
     prior_bandwidth: float = 2.0
@@ -69,9 +85,11 @@ class PlanningSettings:
         check_range(
             self, 1, 1000, "batch", "tried_per_place", "most_weaker", "first_batches", "num_draws"
         )
-        check_range(self, 1, 100, "num_smoothed")
+        check_range(self, 1, 100, "num_smoothed", "most_rollouts", "most_needed")
+        check_range(self, 10, 10_000, "num_datasets", "num_resamplings")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")
+        check_range(self, 0.0, 1.0, "wanted", "least_likely")
         check_range(self, 0.0, 0.5, "least_room")
         check_range(self, 0.0, 1.0, "relative_noise")
         check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")

@@ -21,6 +21,16 @@ def candidates(limits, number=4):
     )
 
 
+def separations(judge, played):
+    """Squared separations along each candidate alone, ``(E, n, n)``."""
+    shown, num = judge.shown(played), len(judge.known.causes)
+    result = np.zeros((len(played.commands), num, num))
+    for k in range(len(result)):
+        for (a, b), blocks in shown.squares([k]).items():
+            result[k, a, b] = blocks.sum()
+    return result
+
+
 def shifted(known, by):
     """The first cause, and the same with other parameters, both known as well as before."""
     first = known.causes[0]
@@ -35,7 +45,7 @@ def test_a_cause_with_other_parameters_imitates_what_the_precision_permits(survi
     by = 0.3 * width
     judge = Judge(shifted(known, by), limits, seed=0)
     played = judge.played(*candidates(limits))
-    found = judge.separations(played)[:, 0, 1]
+    found = separations(judge, played)[:, 0, 1]
     before = known.causes[0].precision
     # In a linear model the difference is J times the shift. Both recordings together determine
     # the parameters as a mean of two estimates with these precisions, a shift apart.
@@ -49,7 +59,7 @@ def test_a_cause_with_other_parameters_imitates_what_the_precision_permits(survi
 def test_a_cause_is_not_separated_from_itself(surviving):
     known, limits = surviving
     judge = Judge(shifted(known, 0.0), limits, seed=0)
-    assert judge.separations(judge.played(*candidates(limits))) == pytest.approx(0.0, abs=1e-6)
+    assert separations(judge, judge.played(*candidates(limits))) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -59,9 +69,24 @@ def test_less_noise_separates_more(surviving):
     squares = []
     for allowed in (limits, replace(limits, channels=channels)):
         judge = Judge(known, allowed, seed=0)
-        squares.append(judge.separations(judge.played(*candidates(limits))))
+        squares.append(separations(judge, judge.played(*candidates(limits))))
     different = ~np.eye(len(known.causes), dtype=bool)
     assert (squares[1] > squares[0])[:, different].all()
+
+
+@pytest.mark.slow
+def test_a_repeated_rollout_separates_at_most_twice_as_much(surviving):
+    known, limits = surviving
+    judge = Judge(known, limits, seed=0)
+    shown = judge.shown(judge.played(*candidates(limits)))
+    for pair, once in shown.squares([0]).items():
+        twice = shown.squares([0, 0])[pair]
+        # What is known of the parameters counts once, so it is at most twice as much.
+        assert len(twice) == 2 * len(once)
+        assert 1.0 - 1e-9 <= twice.sum() / once.sum() <= 2.0 + 1e-9
+        # Parameters that fit two rollouts fit neither of them better than its own.
+        other = shown.squares([1])[pair].sum()
+        assert shown.squares([0, 1])[pair].sum() >= max(once.sum(), other) * (1.0 - 1e-9)
 
 
 @pytest.mark.slow
@@ -73,7 +98,7 @@ def test_certainty_is_that_of_the_pairs(surviving):
     before = -0.5 * np.log([cause.probability for cause in pair.causes]).sum()
     gained = judge.certainty(played) - before
     # Π_k (1 + d_k²/8) of parts d_k² is at least 1 + d²/8 and at most exp(d²/8).
-    square = judge.separations(played)[:, 0, 1]
+    square = separations(judge, played)[:, 0, 1]
     assert (gained >= np.log1p(square / 8.0) * (1.0 - 1e-6)).all()
     assert (gained <= square / 8.0 * (1.0 + 1e-6)).all()
     assert (gained > 1.01 * np.log1p(square / 8.0)).any()

@@ -14,6 +14,7 @@ from npdr_ppl.planning import plan_recording
 from npdr_ppl.planning.causes import causes_of_run, prior_of
 from npdr_ppl.planning.judging import Judge
 from npdr_ppl.planning.limits import ChannelLimits, default_limits, read_limits
+from npdr_ppl.planning.settings import PLANNING
 from tests.helpers.command_line import run_for_module
 
 pytestmark = pytest.mark.slow
@@ -25,7 +26,7 @@ from hidden_rigs.under_test import pendulum as model
 
 @pytest.fixture(scope="module")
 def planned(surviving):
-    return plan_recording(*surviving, rounds=8, seed=1)
+    return plan_recording(*surviving, rollouts=1, rounds=8, seed=1)
 
 
 def test_a_plan_separates_more_than_a_random_recording(planned):
@@ -33,6 +34,38 @@ def test_a_plan_separates_more_than_a_random_recording(planned):
     assert dry.before < 1.5
     assert dry.after > 1.5 * dry.random
     assert planned.to_dict()["smallest_separation"] == min(p.after for p in planned.pairs)
+
+
+def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
+    known, limits = surviving
+    found = plan_recording(known, limits, rounds=3, seed=1)
+    outlook = found.outlook
+    assert outlook.planned.right >= planned.outlook.planned.right - 0.05
+    assert 0.0 <= outlook.planned.wrong < 0.1
+    if outlook.planned.right < PLANNING.wanted:
+        assert len(found.recording) == PLANNING.most_rollouts
+        assert outlook.needed is None or outlook.needed > PLANNING.most_rollouts
+    else:
+        assert len(found.recording) == outlook.needed
+    assert len(found.random) == len(found.recording)
+    more = plan_recording(known, limits, rollouts=3, rounds=3, seed=1)
+    assert len(more.recording) == 3
+    # Three rollouts show more of every pair than the first of them alone.
+    one = plan_recording(known, limits, rollouts=1, rounds=3, seed=1)
+    for pair, less in zip(more.pairs, one.pairs, strict=True):
+        assert pair.after >= less.after * (1.0 - 1e-9)
+
+
+@pytest.mark.parametrize("number", [0, 61])
+def test_a_wrong_number_of_rollouts_gets_a_sentence(number, unrecorded):
+    with pytest.raises(DataError, match=f"between 1 and 60 rollouts, not {number}"):
+        plan_recording(*unrecorded, rollouts=number)
+
+
+def test_several_rollouts_narrow_parameters_more(unrecorded):
+    found = [plan_recording(*unrecorded, rollouts=n, rounds=3) for n in (1, 3)]
+    assert [len(plan.recording) for plan in found] == [1, 3]
+    assert found[1].information > found[0].information
 
 
 def test_every_cause_keeps_the_limits(planned, surviving):
@@ -47,7 +80,7 @@ def test_every_cause_keeps_the_limits(planned, surviving):
 
 
 def test_a_plan_is_the_same_with_the_same_seed(planned, surviving):
-    again = plan_recording(*surviving, rounds=8, seed=1)
+    again = plan_recording(*surviving, rollouts=1, rounds=8, seed=1)
     assert again.recording == planned.recording
     assert again.to_dict() == planned.to_dict()
     assert plan_recording(*surviving, rounds=2, seed=2).recording != planned.recording
@@ -119,6 +152,27 @@ def test_a_plan_after_a_fit_begins_with_its_posterior(fitted):
         assert narrowed.after < narrowed.before == pytest.approx(before)
 
 
+def test_a_plan_after_a_fit_has_its_time_step_and_noise(fitted):
+    found = json.loads((fitted / "fit.json").read_text())
+    found["preparation"] = {
+        "segment_length": 25,
+        "segment_seconds": 0.2,
+        "noise": {"angle": 2e-3},
+        "independent_share": 0.5,
+    }
+    (fitted / "fit.json").write_text(json.dumps(found))
+    known = causes_of_run(fitted, pendulum)
+    assert (known.share, known.segment_length) == (0.5, 25)
+    simulator = known.causes[0].simulator
+    limits = default_limits(simulator, None, time_step=known.time_step, noise=known.noise)
+    assert limits.time_step == pytest.approx(0.008)
+    assert {name: c.noise for name, c in limits.channels.items()} == {"angle": 2e-3}
+    found["preparation"]["noise"] = {"angle": "small"}
+    (fitted / "fit.json").write_text(json.dumps(found))
+    with pytest.raises(DataError, match="a noise that is not a positive number"):
+        causes_of_run(fitted, pendulum)
+
+
 def test_a_fit_of_another_model_gets_a_sentence(fitted):
     with pytest.raises(DataError, match="is a parameter of only one of model"):
         causes_of_run(fitted, make_case("emps", "null", (), seed=1).model)
@@ -175,7 +229,8 @@ def test_the_command_writes_commands_to_play(ambiguous, tmp_path):
     words = "plan", folder, f"{model}:model", "--out", out, "--batches", 4
     code, text, err = run_for_module(*words)
     assert code == 0, err
-    assert "with the plan" in text and "hinge.presliding_friction" in text
+    assert "to name the right cause" in " ".join(text.split())
+    assert "hinge.presliding_friction" in text
     read = npdr.Rollouts.from_csv(out)
     assert read.action_names == ("torque",) and read.channel_names == ("angle", "velocity")
     code, _, err = run_for_module(*words)

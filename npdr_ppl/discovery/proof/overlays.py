@@ -188,9 +188,12 @@ def overlay(
     series = dict(zip(MODELS, made, strict=True))
     measured = [s.double().numpy() for s in rollouts.series(segments.channel_names)]
     channels = segments.channel_names
+    # A rollout that was left out, such as the copy of another one, has no segments.
+    used = torch.unique(segments.inputs.rollout).tolist()
     found = []
-    for place, values in enumerate(measured):
-        shown = {name: made[place] for name, made in series.items() if made is not None}
+    for row, place in enumerate(used):
+        values = measured[place]
+        shown = {name: made[row] for name, made in series.items() if made is not None}
         if any(made.shape != values.shape for made in shown.values()):
             continue
         time = np.arange(len(values), dtype=np.float64) * rollouts.time_step
