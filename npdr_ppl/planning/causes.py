@@ -1,7 +1,8 @@
 """The hypotheses that a plan is for: fitted causes of a run, or draws of the prior."""
 
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from npdr_ppl.posterior.run_folder import MAX_FINER_STEPS
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import DiscoveryRecord, SurvivingCausesRecord
 
-__all__ = ["Cause", "Known", "causes_of_prior", "causes_of_run"]
+__all__ = ["Cause", "Known", "at_time_step", "causes_of_prior", "causes_of_run", "prior_of"]
 
 
 @dataclass(frozen=True)
@@ -64,20 +65,21 @@ class Known:
     Attributes:
         causes: The causes; several draws of the prior are causes of the same name.
         separations: Their distances along the recording so far, ``(n, n)``.
+        time_step: Seconds per step of the recording so far, or of the model without one. Priors of
+            delays and lags, and with them the coordinates, depend on it.
         recorded: The ranges of the recording so far; ``None`` without one.
         share: Effective number of independent measurements as a share of all.
         segment_length: Steps of a segment; ``None`` for the default.
-        time_step: Seconds per step of the recording so far; ``None`` if it is not known.
         noise: Standard deviation of the measurements so far, by channel; empty if not known.
         is_prior: Whether the causes are draws of the prior.
     """
 
     causes: tuple[Cause, ...]
     separations: Tensor
+    time_step: float
     recorded: Mapping[str, Any] | None = None
     share: float = 1.0
     segment_length: int | None = None
-    time_step: float | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
     is_prior: bool = field(default=False)
 
@@ -114,17 +116,18 @@ def causes_of_run(run: Path, model: Callable[..., Any]) -> Known:
     laws = {
         law["effect"]: law["formula"] for law in (found.get("learned") or {}).get("laws") or []
     }
-    causes = tuple(_cause(revised, part, run, laws) for part in record["causes"])
+    step = float(record["time_step"])
+    causes = tuple(_cause(revised, part, run, laws, step) for part in record["causes"])
     separations = torch.tensor(record["separations"], dtype=torch.float64)
     if not causes or separations.shape != (len(causes), len(causes)):
         raise DataError(f"{run} keeps causes and separations that do not fit together.")
     return Known(
         causes,
         separations,
+        step,
         record,
         record["independent_share"],
         record["segment_length"],
-        record["time_step"],
         record["noise"],
     )
 
@@ -136,7 +139,8 @@ def causes_of_prior(model: Callable[..., Any], seed: int) -> Known:
         model: The model.
         seed: Seed of the draws.
     """
-    prior = prior_of(model)
+    step = only_simulator(model)[0].simulator.time_step
+    prior = prior_of(model, step)
     generator = torch.Generator().manual_seed(seed)
     shape = PLANNING.num_draws - 1, prior.num_parameters
     draws = torch.randn(shape, generator=generator, dtype=torch.float64)
@@ -144,23 +148,65 @@ def causes_of_prior(model: Callable[..., Any], seed: int) -> Known:
     draws = torch.cat((torch.zeros_like(draws[:1]), draws))
     eye = torch.eye(prior.num_parameters, dtype=torch.float64)
     causes = tuple(Cause("the prior", model, z, eye) for z in draws)
-    return Known(causes, torch.zeros(len(causes), len(causes)), is_prior=True)
+    return Known(causes, torch.zeros(len(causes), len(causes)), step, is_prior=True)
 
 
-def prior_of(model: Model) -> Prior:
-    """Returns a model's prior without a recording."""
+def prior_of(model: Model, time_step: float) -> Prior:
+    """Returns a model's prior without a recording.
+
+    Args:
+        model: The model.
+        time_step: Seconds per step of the recordings. The priors of delays and lags reach at least
+            a few steps.
+    """
     # Inputs without channels, which a program only passes on.
     nothing = Inputs.single(
-        torch.zeros(1, 0), torch.zeros(0), action_names=(), state_names=(), time_step=1.0
+        torch.zeros(1, 0), torch.zeros(0), action_names=(), state_names=(), time_step=time_step
     )
     return Prior(with_noise(model, None), (nothing,))
+
+
+def at_time_step(known: Known, time_step: float) -> Known:
+    """Returns the same knowledge for recordings with another time step.
+
+    Raises:
+        DataError: The priors at that time step do not contain a cause's parameters.
+    """
+    if math.isclose(time_step, known.time_step):
+        return known
+    causes = tuple(_cause_at(cause, known.time_step, time_step) for cause in known.causes)
+    # A segment keeps its length in seconds.
+    length = known.segment_length
+    if length is not None:
+        length = max(2, round(length * known.time_step / time_step))
+    return replace(known, causes=causes, time_step=time_step, segment_length=length)
+
+
+def _cause_at(cause: Cause, before: float, after: float) -> Cause:
+    """Returns a cause whose coordinates are those of the priors at another time step."""
+    old, new = prior_of(cause.model, before), prior_of(cause.model, after)
+
+    def moved(z: Tensor) -> Tensor:
+        return new.to_reference(old.to_parameters(z[None]))[0].to(z)
+
+    z = moved(cause.z)
+    slope = (moved(cause.z + 1e-3) - moved(cause.z - 1e-3)) / 2e-3  # by coordinate
+    kept, wanted = new.to_parameters(z[None]), old.to_parameters(cause.z[None])
+    is_kept = all(torch.allclose(kept[name], wanted[name], rtol=1e-3) for name in wanted)
+    if not (is_kept and bool((slope > 0.0).all())):
+        raise DataError(
+            f"{cause.name} has parameters outside the priors for a time step of {after:g} s; plan "
+            f"with a time step closer to that of the recording, {before:g} s."
+        )
+    return replace(cause, z=z, precision=cause.precision / slope / slope[:, None])
 
 
 def _causes_of_fit(run: Path, model: Callable[..., Any]) -> Known:
     """Returns the posterior of a fit: its means, and its standard deviations."""
     found = identified(run)
     revised = _revised(model, found.finer_steps, [], run)
-    prior = prior_of(revised)
+    step = found.time_step or only_simulator(revised)[0].simulator.time_step
+    prior = prior_of(revised, step)
     record: Mapping[str, Any] = read_json(run / "fit.json")
     names = [site.name for site in prior.sites]
     if set(names) != set(found.values):
@@ -186,9 +232,9 @@ def _causes_of_fit(run: Path, model: Callable[..., Any]) -> Known:
     return Known(
         (cause,),
         torch.zeros(1, 1),
+        step,
         share=float(prepared.get("independent_share") or 1.0),
         segment_length=prepared.get("segment_length"),
-        time_step=found.time_step,
         noise=_noise(prepared, revised, run),
     )
 
@@ -232,21 +278,26 @@ def _revised(
 
 
 def _cause(
-    model: Callable[..., Any], part: Mapping[str, Any], run: Path, laws: Mapping[str, str]
+    model: Callable[..., Any],
+    part: Mapping[str, Any],
+    run: Path,
+    laws: Mapping[str, str],
+    time_step: float,
 ) -> Cause:
     """Returns a stored cause of a model; ``laws`` are the learned formulas by effect."""
     effects = [_effect(described, run, laws) for described in part["effects"]]
     for effect in effects:
         model = add_effect(model, effect)
     try:
-        names = {site.name for site in prior_of(model).sites}
+        prior = prior_of(model, time_step)
     except NpdrError as error:
         raise DataError(f"{run} is not of this model: {error}") from None
+    names = {site.name for site in prior.sites}
     z = torch.tensor(part["coordinates"], dtype=torch.float64)
     precision = torch.tensor(part["precision"], dtype=torch.float64)
     if names != set(part["parameters"]):
         raise DataError(_other_model(run, names ^ set(part["parameters"])))
-    if precision.shape != (len(z), len(z)) or len(z) != prior_of(model).num_parameters:
+    if precision.shape != (len(z), len(z)) or len(z) != prior.num_parameters:
         raise DataError(f"{run} keeps a cause whose numbers do not fit together.")
     name = " + ".join(effect.name for effect in effects) or "the original model"
     return Cause(name, model, z, precision, part["probability"])

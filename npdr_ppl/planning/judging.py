@@ -71,7 +71,7 @@ class Judge:
     """Simulates candidates in every cause and predicts what they would show.
 
     Args:
-        known: The causes and what is known of them.
+        known: The causes and what is known of them, at the time step of the limits.
         limits: The limits.
         seed: Seed of the simulated noise, from which the errors of initial states follow.
 
@@ -95,7 +95,7 @@ class Judge:
         )
         shape = (limits.num_steps + 1, len(self.channels))
         self._noise = np.random.default_rng(seed).standard_normal(shape) * self.scale.numpy()
-        self._boxes = [_box(cause) for cause in known.causes]
+        self._boxes = [_box(cause, known.time_step) for cause in known.causes]
         self.num_simulated = 0
         self.failure = ""
         self.batch, self._every = self._work()
@@ -392,8 +392,8 @@ def information_gain(before: Tensor, after: Tensor) -> Tensor:
     return 0.5 * (torch.linalg.slogdet(after).logabsdet - torch.linalg.slogdet(before).logabsdet)
 
 
-def _box(cause: Cause) -> SimulatorBlackBox:
+def _box(cause: Cause, time_step: float) -> SimulatorBlackBox:
     """Returns a cause's simulator with its parameters."""
-    (box,) = prior_of(cause.model).black_boxes_at(cause.z[None]).values()
+    (box,) = prior_of(cause.model, time_step).black_boxes_at(cause.z[None]).values()
     assert isinstance(box, SimulatorBlackBox)
     return box

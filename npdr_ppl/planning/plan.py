@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.errors import DataError
-from npdr_ppl.planning.causes import Known, prior_of
+from npdr_ppl.planning.causes import Known, at_time_step, prior_of
 from npdr_ppl.planning.chances import Chance
 from npdr_ppl.planning.excitations import Candidate, Excitations
 from npdr_ppl.planning.judging import Judge, Played, Shown, information_gain
@@ -173,6 +173,7 @@ def plan_recording(
         DataError: No excitation keeps the limits in all causes, or a channel has no noise.
     """
     _check(limits, rollouts)
+    known = at_time_step(known, limits.time_step)
     excitations = Excitations(limits, np.random.default_rng(seed))
     judge = Judge(known, limits, seed)
     separates = len(known.causes) > 1 and not known.is_prior
@@ -318,7 +319,7 @@ def _widths(
         ]
         widths.append([p.inverse().diagonal().sqrt().numpy() for p in every])
         gains.append(float(information_gain(every[0], every[1])))
-    prior = prior_of(known.causes[0].model)
+    prior = prior_of(known.causes[0].model, known.time_step)
     names = [
         site.name if width == 1 else f"{site.name}[{k}]"
         for site in prior.sites

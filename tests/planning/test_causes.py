@@ -1,6 +1,7 @@
 """The causes of a run with a learned law, whose file is among the added effects or not."""
 
 import json
+from statistics import NormalDist
 
 import pytest
 
@@ -8,7 +9,7 @@ from npdr_ppl.discovery.proof.surviving_causes import VERSION
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effect_additions import add_file
 from npdr_ppl.models.pendulum import pendulum
-from npdr_ppl.planning.causes import causes_of_run
+from npdr_ppl.planning.causes import at_time_step, causes_of_run, prior_of
 from tests.helpers.effect_files import CUBIC
 
 
@@ -50,6 +51,52 @@ def test_a_learned_law_is_a_cause_once_its_file_is_added(run):
     add_file(run / "learned_effect.py")
     (cause,) = causes_of_run(run, pendulum).causes
     assert cause.name == "hinge.learned_hinge"
+
+
+@pytest.fixture
+def delayed(run):
+    """The same folder, with a delay of the sensors as the cause, at the middle of its prior."""
+    found = json.loads((run / "discovery.json").read_text())
+    (cause,) = found["surviving_causes"]["causes"]
+    delay = {"effect": "sensor_delay", "port": "angle,velocity", "constants": {}}
+    cause["effects"] = [delay]
+    cause["parameters"] = {"mass": 1.0, "length": 1.0, "angle,velocity.sensor_delay.delay": 0.03}
+    (run / "discovery.json").write_text(json.dumps(found))
+    return run
+
+
+def parameters(known):
+    (cause,) = known.causes
+    values = prior_of(cause.model, known.time_step).to_parameters(cause.z[None])
+    return {name: float(value) for name, value in values.items()}
+
+
+def test_the_prior_of_a_delay_is_that_of_the_recorded_time_step(delayed):
+    # It reaches three steps of 0.02 s, and the delay is at its middle.
+    found = parameters(causes_of_run(delayed, pendulum))
+    assert found["angle,velocity.sensor_delay.delay"] == pytest.approx(0.03)
+
+
+def test_another_time_step_keeps_the_parameters_and_how_well_they_are_known(delayed):
+    known = causes_of_run(delayed, pendulum)
+    moved = at_time_step(known, 0.016)
+    assert parameters(moved) == pytest.approx(parameters(known))
+    assert moved.segment_length == 25  # 0.4 s
+    # Where the priors are wider by a factor, a standard deviation is a smaller share of them.
+    one, other = known.causes[0], moved.causes[0]
+    assert float(one.z[2]) == pytest.approx(0.0) and float(other.z[2]) > 0.1
+    precision = other.precision.diagonal() / one.precision.diagonal()
+    density = NormalDist().pdf(float(other.z[2])) / NormalDist().pdf(0.0)
+    assert precision.tolist() == pytest.approx([1.0, 1.0, (0.048 / 0.06 * density) ** 2], rel=1e-2)
+    assert at_time_step(known, 0.02) is known
+
+
+def test_a_delay_longer_than_the_prior_at_another_time_step_gets_a_sentence(delayed):
+    found = json.loads((delayed / "discovery.json").read_text())
+    found["surviving_causes"]["causes"][0]["coordinates"] = [0.0, 0.0, 0.5]  # 41 ms
+    (delayed / "discovery.json").write_text(json.dumps(found))
+    with pytest.raises(DataError, match="closer to that of the recording, 0.02 s"):
+        at_time_step(causes_of_run(delayed, pendulum), 0.008)
 
 
 def test_another_law_of_the_same_port_is_not_taken_for_it(run, tmp_path):

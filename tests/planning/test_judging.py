@@ -35,7 +35,7 @@ def shifted(known, by):
     """The first cause, and the same with other parameters, both known as well as before."""
     first = known.causes[0]
     causes = (first, replace(first, z=first.z + by))
-    return Known(causes, torch.zeros(2, 2), share=0.5)
+    return Known(causes, torch.zeros(2, 2), known.time_step, share=0.5)
 
 
 @pytest.mark.slow

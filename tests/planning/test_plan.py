@@ -141,7 +141,7 @@ def fitted(tmp_path):
 def test_a_plan_after_a_fit_begins_with_its_posterior(fitted):
     known = causes_of_run(fitted, pendulum)
     (cause,) = known.causes
-    values = prior_of(pendulum).to_parameters(cause.z[None])
+    values = prior_of(pendulum, known.time_step).to_parameters(cause.z[None])
     assert [float(values[n]) for n in ("mass", "length")] == pytest.approx([1.0, 0.9])
     # The priors are uniform on (0.3, 1.7): a density of 1/1.4 against a normal one of 0.4.
     width = cause.precision.inverse().diagonal().sqrt()
