@@ -57,7 +57,7 @@ UNDECIDABLE = 0.5
 NAMED = 0.05
 """Probability from which a cause is left, as in the verdict."""
 
-STRENGTHS = (0.02, 0.05, 0.1, 0.2)
+STRENGTHS = (0.05, 0.1, 0.2, 0.4)
 """Multiples of an effect's typical size, in turn: weak effects are ambiguous more often."""
 
 

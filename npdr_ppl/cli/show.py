@@ -418,16 +418,33 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
         table.add_row(*map(escape, names), *(format(figure, digits) for figure in figures))
     console.print(table)
     console.print(_told_by_plan(found), highlight=False)
-    for index, values in enumerate(found["starts"]):
-        start = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-        which = f"rollout {index}" if len(found["starts"]) > 1 else "it"
-        console.print(f"Start {which} at rest at {start}.", highlight=False)
+    starts = [
+        ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+        for values in found["starts"]
+    ]
+    if len(set(starts)) == 1:
+        console.print(f"Start at rest at {starts[0]}.", highlight=False)
+    else:
+        for index, start in enumerate(starts):
+            console.print(f"Start rollout {index} at rest at {start}.", highlight=False)
     if found["has_stopped"]:
         console.print("The time limit ended the search; a longer --search-time may find more.")
     rollouts = f"{found['rollouts']} rollouts of " if found["rollouts"] > 1 else ""
     console.print(
         f"The commands for {rollouts}{found['duration']:.4g} s are in {out}", highlight=False
     )
+
+
+_LIMITS = {
+    "commands": "commands",
+    "channels": "positions and speeds",
+    "bandwidth": "bandwidth",
+}
+"""Kinds of limits, as a person is told."""
+
+_LEAST_GAIN = 0.1
+"""Gain of chance from which wider limits are recommended; the chances have standard errors of
+0.025."""
 
 
 def _told_by_plan(found: Mapping[str, Any]) -> str:
@@ -451,11 +468,21 @@ def _told_by_plan(found: Mapping[str, Any]) -> str:
     if outlook["chance_of_the_right_name"] >= wanted:
         return told
     if needed is None:
-        return (
-            f"{told} Within these limits, even {outlook['most_needed_rollouts']} rollouts do not "
-            f"suffice for {wanted:.0%}: allow more position, speed, command or bandwidth."
-        )
-    return f"{told} For {wanted:.0%}, about {needed} rollouts are needed: --rollouts {needed}."
+        most = outlook["most_needed_rollouts"]
+        told = f"{told} Within these limits, even {most} rollouts do not suffice for {wanted:.0%}."
+    else:
+        told = f"{told} For {wanted:.0%}, about {needed} rollouts are needed: --rollouts {needed}."
+    # A short search finds less than the plan did, so only what exceeds it is an advice.
+    better = {
+        limit: f"twice the {_LIMITS[limit]}: {chance:.0%}"
+        for limit, chance in outlook["with_twice_the"].items()
+        if chance > outlook["chance_of_the_right_name"] + _LEAST_GAIN
+    }
+    if better:
+        return f"{told} With {', with '.join(better.values())}."
+    if outlook["with_twice_the"]:
+        return f"{told} A short search within limits twice as wide found nothing better."
+    return told
 
 
 def _console() -> Console:

@@ -2,8 +2,9 @@
 
 import itertools
 import math
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,13 @@ from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.errors import DataError
 from npdr_ppl.planning.causes import Known, at_time_step, prior_of
 from npdr_ppl.planning.chances import Chance
-from npdr_ppl.planning.excitations import Candidate, Excitations
+from npdr_ppl.planning.exploration import Explored, explore, separates
 from npdr_ppl.planning.judging import Judge, Played, Shown, information_gain
 from npdr_ppl.planning.limits import Limits
-from npdr_ppl.planning.search import Found, search_excitations
+from npdr_ppl.planning.search import Found
 from npdr_ppl.planning.selection import chance_of, rollouts_that_inform, rollouts_that_separate
 from npdr_ppl.planning.settings import PLANNING
+from npdr_ppl.planning.wider import Wider, chances_with_wider_limits
 from npdr_ppl.progress import Step
 from npdr_ppl.rollouts import Rollouts
 
@@ -73,11 +75,13 @@ class Outlook:
         random: The same after as many random rollouts.
         needed: Number of such rollouts after which the chance is at least 0.9; ``None`` if more
             than 60 would be needed.
+        wider: The chance with each limit twice as wide, if that of the plan is less than 0.9.
     """
 
     planned: Chance
     random: Chance
     needed: int | None
+    wider: tuple[Wider, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values."""
@@ -88,6 +92,7 @@ class Outlook:
             "wanted_chance": PLANNING.wanted,
             "needed_rollouts": self.needed,
             "most_needed_rollouts": PLANNING.most_needed,
+            "with_twice_the": {wider.limit: wider.chance for wider in self.wider},
         }
 
 
@@ -173,28 +178,31 @@ def plan_recording(
         DataError: No excitation keeps the limits in all causes, or a channel has no noise.
     """
     _check(limits, rollouts)
-    known = at_time_step(known, limits.time_step)
-    excitations = Excitations(limits, np.random.default_rng(seed))
-    judge = Judge(known, limits, seed)
-    separates = len(known.causes) > 1 and not known.is_prior
-
-    def value_of(played: Played) -> Array:
-        return judge.certainty(played) if separates else judge.gains(played)
-
-    found = search_excitations(
-        excitations, judge, value_of, rounds=rounds, time_limit=time_limit, progress=progress
+    begin, known = time.monotonic(), at_time_step(known, limits.time_step)
+    is_separating = separates(known)
+    explored = explore(
+        known,
+        limits,
+        num_candidates=None if is_separating or rollouts else 1,
+        rounds=rounds,
+        time_limit=time_limit * (PLANNING.search_share if is_separating else 1.0),
+        seed=seed,
+        progress=progress,
     )
-    if not found.pool:
-        raise _nothing_found(known, judge, found)
-    # All segments are judged now, so no more candidates than a batch has.
-    pool = found.pool[: max(1, judge.batch // 2)]
-    random = found.random[: max(1, judge.batch // 2)]
-    if not separates and rollouts is None:
-        pool, random = pool[:1], random[:1]
-    played = _played(excitations, judge, [*pool, *random])
-    if separates:
-        return _separating(known, judge, played, len(pool), rollouts, found)
-    return _informing(known, judge, played, len(pool), rollouts or 1, found)
+    if not is_separating:
+        return _informing(known, explored, rollouts or 1)
+    plan = _separating(known, explored, rollouts)
+    outlook = plan.outlook
+    if outlook is None or outlook.planned.right >= PLANNING.wanted:
+        return plan
+    wider = chances_with_wider_limits(
+        known,
+        limits,
+        len(plan.recording),
+        seed=seed,
+        time_limit=time_limit - (time.monotonic() - begin),
+    )
+    return replace(plan, outlook=replace(outlook, wider=wider))
 
 
 def _check(limits: Limits, rollouts: int | None) -> None:
@@ -210,81 +218,68 @@ def _check(limits: Limits, rollouts: int | None) -> None:
         )
 
 
-def _nothing_found(known: Known, judge: Judge, found: Found) -> DataError:
-    """Returns why no excitation was found."""
-    if found.num_judged:
-        return DataError(
-            "The causes cannot be simulated in short segments of any excitation; the model may "
-            "need smaller integration steps."
-        )
-    return DataError(
-        f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "
-        "limits; allow more position, speed or acceleration, or search longer."
-        + (f" A simulation failed: {judge.failure}" if judge.failure else "")
-    )
-
-
-def _separating(
-    known: Known, judge: Judge, played: Played, num_pool: int, rollouts: int | None, found: Found
-) -> Plan:
+def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
     """Returns the plan that tells several causes apart.
 
     Args:
         known: The causes.
-        judge: Predicts what candidates would show.
-        played: The candidates to choose from, then random ones.
-        num_pool: Number of the candidates to choose from.
+        explored: The candidates.
         rollouts: Number of rollouts; ``None`` for as many as are needed.
-        found: The course of the search.
     """
-    shown, pool = judge.shown(played), range(num_pool)
+    shown = explored.judge.shown(explored.played)
     allowed = rollouts or PLANNING.most_rollouts
     every = rollouts_that_separate(
-        known, shown, pool, least=rollouts or 1, most=max(allowed, PLANNING.most_needed)
+        known,
+        shown,
+        explored.every,
+        least=rollouts or 1,
+        most=max(allowed, PLANNING.most_needed),
     )
     chosen = every[:allowed]
-    random = _in_turn(range(num_pool, len(played.commands)), len(chosen))
+    random = explored.random(len(chosen))
     is_enough = chance_of(known, shown, every).right >= PLANNING.wanted
     outlook = Outlook(
         chance_of(known, shown, chosen),
         chance_of(known, shown, random),
         len(every) if is_enough else None,
     )
-    return Plan(
-        _recording(judge, played, chosen),
-        _pairs(known, shown, chosen, random),
-        outlook,
-        (),
-        math.nan,
-        judge.limits,
-        found,
-        _recording(judge, played, random),
-    )
+    pairs = _pairs(known, shown, chosen, random)
+    return _plan(explored, chosen, random, pairs=pairs, outlook=outlook)
 
 
-def _informing(
-    known: Known, judge: Judge, played: Played, num_pool: int, rollouts: int, found: Found
-) -> Plan:
+def _informing(known: Known, explored: Explored, rollouts: int) -> Plan:
     """Returns the plan that narrows parameters; see :func:`_separating`."""
-    information = [judge.information(played, k) for k in range(len(known.causes))]
-    chosen = rollouts_that_inform(known, information, range(num_pool), rollouts)
-    random = _in_turn(range(num_pool, len(played.commands)), len(chosen))
+    information = [
+        explored.judge.information(explored.played, k) for k in range(len(known.causes))
+    ]
+    chosen = rollouts_that_inform(known, information, explored.every, rollouts)
+    random = explored.random(len(chosen))
     widths, gain = _widths(known, information, chosen, random)
+    return _plan(explored, chosen, random, widths=widths, information=gain)
+
+
+def _plan(
+    explored: Explored,
+    chosen: Sequence[int],
+    random: Sequence[int],
+    *,
+    pairs: tuple[Pair, ...] = (),
+    outlook: Outlook | None = None,
+    widths: tuple[Width, ...] = (),
+    information: float = math.nan,
+) -> Plan:
+    """Returns the plan of chosen candidates, and as many random ones."""
+    judge, played = explored.judge, explored.played
     return Plan(
         _recording(judge, played, chosen),
-        (),
-        None,
+        pairs,
+        outlook,
         widths,
-        gain,
+        information,
         judge.limits,
-        found,
+        explored.found,
         _recording(judge, played, random),
     )
-
-
-def _in_turn(members: Sequence[int], number: int) -> list[int]:
-    """Returns a number of members, in turn."""
-    return [members[k % len(members)] for k in range(number)]
 
 
 def _pairs(
@@ -345,11 +340,4 @@ def _recording(judge: Judge, played: Played, chosen: Sequence[int]) -> Rollouts:
         time_step=judge.limits.time_step,
         channel_units=[units.get(name, "") for name in judge.channels],
         action_units=[units.get(name, "") for name in judge.actions],
-    )
-
-
-def _played(excitations: Excitations, judge: Judge, candidates: Sequence[Candidate]) -> Played:
-    return judge.played(
-        np.stack([excitations.commands(c) for c in candidates]),
-        np.stack([excitations.start(c) for c in candidates]),
     )

@@ -1,7 +1,7 @@
 """Random search with refinement over excitations, deterministic with its seed."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from npdr_ppl.planning.judging import Judge, Played
 from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.progress import Step
 
-__all__ = ["Found", "search_excitations"]
+__all__ = ["Found", "played_by", "search_excitations"]
 
 Array = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ def _within_limits(
     kept: list[Candidate] = []
     parts: list[Played] = []
     for _ in range(PLANNING.most_weaker):
-        played = _played(excitations, judge, made)
+        played = played_by(excitations, judge, made)
         violation = judge.violation(played)
         room = judge.batch - len(kept)
         good = [k for k in range(len(made)) if violation[k] <= 0.0][:room]
@@ -142,7 +142,8 @@ def _within_limits(
     return kept, Played.joined(parts)
 
 
-def _played(excitations: Excitations, judge: Judge, candidates: list[Candidate]) -> Played:
+def played_by(excitations: Excitations, judge: Judge, candidates: Sequence[Candidate]) -> Played:
+    """Returns what every cause simulates of some candidates."""
     return judge.played(
         np.stack([excitations.commands(c) for c in candidates]),
         np.stack([excitations.start(c) for c in candidates]),

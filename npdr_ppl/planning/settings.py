@@ -42,6 +42,8 @@ class PlanningSettings:
             Six rollouts of 10 s are a minute of recording.
         most_needed: Greatest number of rollouts up to which the number that would be needed is
             told; more of 10 s each take over 10 minutes.
+        search_share: Share of the time limit for the search, if there are causes to tell apart.
+            The rest is for what would be possible with wider limits.
         wanted: Chance of naming the right cause from which no further rollout is added; that with
             which discovery itself names a cause.
         least_likely: Probability of a cause that was stored as zero.
@@ -71,6 +73,7 @@ class PlanningSettings:
     relative_noise: float = 1e-3
     most_rollouts: int = 6
     most_needed: int = 60
+    search_share: float = 0.7
     wanted: float = 0.9
     least_likely: float = 1e-6
     num_datasets: int = 400
@@ -89,7 +92,7 @@ class PlanningSettings:
         check_range(self, 10, 10_000, "num_datasets", "num_resamplings")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")
-        check_range(self, 0.0, 1.0, "wanted", "least_likely")
+        check_range(self, 0.0, 1.0, "wanted", "least_likely", "search_share")
         check_range(self, 0.0, 0.5, "least_room")
         check_range(self, 0.0, 1.0, "relative_noise")
         check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")

@@ -4,7 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from hidden_rigs import make_case
 
+import npdr_ppl as npdr
+from npdr_ppl.discovery import DiscoveryOptions
 from npdr_ppl.discovery.proof.overlays import MOST_POINTS, Overlay, Overlays, ResidualMap
 from npdr_ppl.run_files import plain, read_json, write_json
 from npdr_ppl.run_records import OverlayRecord
@@ -90,3 +93,21 @@ def test_a_map_has_a_row_per_channel():
     cells = np.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]])
     shown = ResidualMap(0, 6.0, cells, cells).to_dict()
     assert shown["before"] == [[1.0, 3.0, 5.0], [2.0, None, 6.0]]
+
+
+@pytest.mark.slow
+def test_a_rollout_that_is_left_out_is_not_drawn():
+    case = make_case("pendulum", "null", (), seed=1)
+    first = case.fit[[1]]
+    recorded = first.concatenate(first, case.fit[[0]])  # the copy is left out
+    found = npdr.discover(
+        case.model, recorded, search=DiscoveryOptions(max_effects=0), progress=False
+    )
+    assert [
+        shown.rollout for shown in sorted(found.overlays.rollouts, key=lambda o: o.rollout)
+    ] == [
+        0,
+        2,
+    ]
+    for shown, rollout in ((o, recorded[[o.rollout]]) for o in found.overlays.rollouts):
+        assert shown.measured == pytest.approx(rollout.readings[0][:-1])

@@ -13,8 +13,9 @@ from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.planning import plan_recording
 from npdr_ppl.planning.causes import causes_of_run, prior_of
 from npdr_ppl.planning.judging import Judge
-from npdr_ppl.planning.limits import ChannelLimits, default_limits, read_limits
+from npdr_ppl.planning.limits import ActionLimits, ChannelLimits, default_limits, read_limits
 from npdr_ppl.planning.settings import PLANNING
+from npdr_ppl.planning.wider import wider_limits
 from tests.helpers.command_line import run_for_module
 
 pytestmark = pytest.mark.slow
@@ -54,6 +55,34 @@ def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
     one = plan_recording(known, limits, rollouts=1, rounds=3, seed=1)
     for pair, less in zip(more.pairs, one.pairs, strict=True):
         assert pair.after >= less.after * (1.0 - 1e-9)
+
+
+def test_a_plan_that_does_not_suffice_says_what_wider_limits_would_give(surviving):
+    known, limits = surviving
+    channels = {n: replace(c, noise=30.0 * c.noise) for n, c in limits.channels.items()}
+    narrow = replace(limits, channels=channels)
+    found = plan_recording(known, narrow, rollouts=1, rounds=2, seed=1)
+    assert found.outlook.planned.right < PLANNING.wanted
+    wider = {one.limit: one.chance for one in found.outlook.wider}
+    assert set(wider) == set(wider_limits(narrow)) == {"commands", "channels", "bandwidth"}
+    assert all(0.0 <= chance <= 1.0 for chance in wider.values())
+    assert list(wider.values()) == sorted(wider.values(), reverse=True)
+    assert found.to_dict()["outlook"]["with_twice_the"] == wider
+
+
+def test_wider_limits_are_twice_as_wide_about_the_same_middle(unrecorded):
+    _, limits = unrecorded
+    action = ActionLimits(-1.0, 3.0, max_rate=10.0, start=0.5)
+    channel = ChannelLimits(-1.0, 2.0, max_rate=4.0, noise=1e-3)
+    free = replace(limits, bandwidth=0.5 / limits.time_step, actions={"torque": action})
+    wider = wider_limits(replace(free, channels={"angle": channel}))
+    torque = wider["commands"].actions["torque"]
+    assert (torque.min, torque.max, torque.max_rate, torque.start) == (-2.5, 5.5, 20.0, 0.5)
+    angle = wider["channels"].channels["angle"]
+    assert (angle.min, angle.max, angle.max_rate, angle.noise) == (-2.5, 3.5, 8.0, 1e-3)
+    # Half the sampling rate cannot be exceeded, and what has no limits cannot be wider.
+    assert "bandwidth" not in wider
+    assert "channels" not in wider_limits(replace(free, channels={"angle": ChannelLimits()}))
 
 
 @pytest.mark.parametrize("number", [0, 61])

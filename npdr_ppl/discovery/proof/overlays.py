@@ -199,7 +199,7 @@ def overlay(
         time = np.arange(len(values), dtype=np.float64) * rollouts.time_step
         misfit = {name: _misfit(made, values, channels) for name, made in shown.items()}
         found.append(Overlay(place, time, values, shown, misfit))
-    found.sort(key=lambda one: _missed(one, measured), reverse=True)
+    found.sort(key=lambda one: _missed(one, [measured[k] for k in used]), reverse=True)
     units = {s.name: s.unit for s in segments.measured}
     maps = _maps(searched, after)
     return Overlays(is_held_out, channels, units, tuple(found[:MOST_ROLLOUTS]), maps)

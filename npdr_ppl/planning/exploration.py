@@ -1,0 +1,102 @@
+"""Searches excitations within limits, and simulates the best of them and random ones in full."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from npdr_ppl.errors import DataError
+from npdr_ppl.planning.causes import Known
+from npdr_ppl.planning.excitations import Excitations
+from npdr_ppl.planning.judging import Judge, Played
+from npdr_ppl.planning.limits import Limits
+from npdr_ppl.planning.search import Found, played_by, search_excitations
+from npdr_ppl.progress import Step
+
+__all__ = ["Explored", "explore", "separates"]
+
+
+@dataclass(frozen=True)
+class Explored:
+    """The result of a search, simulated in every cause.
+
+    Attributes:
+        judge: Predicts what the candidates would show.
+        found: The course of the search.
+        played: The best candidates, then random ones.
+        num_pool: Number of the best ones.
+    """
+
+    judge: Judge
+    found: Found
+    played: Played
+    num_pool: int
+
+    @property
+    def every(self) -> Sequence[int]:
+        """All candidates, of which a plan may use each."""
+        return range(len(self.played.commands))
+
+    def random(self, number: int) -> list[int]:
+        """Returns a number of random candidates, in turn if there are fewer."""
+        members = self.every[self.num_pool :]
+        return [members[k % len(members)] for k in range(number)]
+
+
+def separates(known: Known) -> bool:
+    """Returns whether there are several causes to tell apart, and not only parameters to find."""
+    return len(known.causes) > 1 and not known.is_prior
+
+
+def explore(
+    known: Known,
+    limits: Limits,
+    *,
+    num_candidates: int | None = None,
+    rounds: int,
+    time_limit: float,
+    seed: int,
+    progress: Step = lambda fraction, status: None,
+) -> Explored:
+    """Searches the excitations that tell the causes apart, or that narrow parameters.
+
+    Args:
+        known: The causes, at the time step of the limits.
+        limits: What the robot may do.
+        num_candidates: Greatest number of the best candidates that are returned, and of random
+            ones; ``None`` for as many as are judged in half a batch, since all of their segments
+            are judged next.
+        rounds: Number of batches.
+        time_limit: Seconds after which no further batch begins.
+        seed: Seed of the search.
+        progress: Called with the fraction of the search that is done.
+
+    Raises:
+        DataError: No excitation keeps the limits in all causes.
+    """
+    excitations = Excitations(limits, np.random.default_rng(seed))
+    judge = Judge(known, limits, seed)
+    value_of = judge.certainty if separates(known) else judge.gains
+    found = search_excitations(
+        excitations, judge, value_of, rounds=rounds, time_limit=time_limit, progress=progress
+    )
+    if not found.pool:
+        raise _nothing_found(known, judge, found)
+    most = num_candidates or max(1, judge.batch // 2)
+    pool, random = found.pool[:most], found.random[:most]
+    played = played_by(excitations, judge, [*pool, *random])
+    return Explored(judge, found, played, len(pool))
+
+
+def _nothing_found(known: Known, judge: Judge, found: Found) -> DataError:
+    """Returns why no excitation was found."""
+    if found.num_judged:
+        return DataError(
+            "The causes cannot be simulated in short segments of any excitation; the model may "
+            "need smaller integration steps."
+        )
+    return DataError(
+        f"None of {judge.num_simulated // len(known.causes)} simulated excitations kept the "
+        "limits; allow more position, speed or acceleration, or search longer."
+        + (f" A simulation failed: {judge.failure}" if judge.failure else "")
+    )
