@@ -3,7 +3,7 @@
 import difflib
 import json
 import keyword
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +12,7 @@ import typer
 
 from npdr_ppl.atomic_files import replacing
 from npdr_ppl.cli.manners import AsJson, Quiet
-from npdr_ppl.cli.options import OptionalModelArgument
+from npdr_ppl.cli.options import EffectOption, OptionalModelArgument
 from npdr_ppl.errors import DataError, ModelError
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def export(
     kind: Annotated[
         Kind | None, typer.Option("--as", help="What to write; by default from the ending.")
     ] = None,
+    effect: EffectOption = None,
     draws: Annotated[int, typer.Option(min=1, help="Most draws of the posterior to write.")] = 500,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -69,6 +70,9 @@ def export(
     another draw at every reset, or a configuration of Isaac Lab's events. MODEL may be left out
     for a table, and for a discovery: then revised_model.py in its folder is run.
 
+    An effect of your own file, or a learned law, is given as in npdr fit:
+    --effect learned_effect.py:LearnedElbow@elbow. Its law is written as numpy.
+
     Example: npdr export fit arm.xml --to arm_identified.xml
     """
     from npdr_ppl.posterior.robot_file import identified
@@ -78,11 +82,12 @@ def export(
     kind = _kind(to, kind)
     found = identified(run)
     if kind is Kind.ROBOT:
-        told = _robot(run, found, model, to, shows=not (as_json or quiet))
+        own = _model(run, model, effect)
+        told = _robot(found, own, to, shows=not (as_json or quiet))
     elif kind is Kind.RANGES:
         told = _ranges(run, to, draws)
     else:
-        told = _draws(run, found, model, to, kind, draws)
+        told = _draws(run, found, lambda: _model(run, model, effect), to, kind, draws)
     told |= {"verdict": found.verdict or None}
     if as_json:
         typer.echo(json.dumps(told, ensure_ascii=False))
@@ -105,25 +110,23 @@ def _kind(to: Path, kind: Kind | None) -> Kind:
     return next(iter(possible)) if kind is None else kind
 
 
-def _model(run: Path, word: str | None) -> Any:
+def _model(run: Path, word: str | None, effects: Sequence[str] | None) -> Any:
     """Returns the model of a run; that of a discovery by default is its revised model."""
-    from npdr_ppl.cli.resolve import resolve_model
+    from npdr_ppl.cli.resolve import resolve_effects, resolve_model
 
     revised = run / "revised_model.py"
     if word is None and not revised.is_file():
         raise ModelError(f"Give the model of the run, as in npdr export {run} arm.xml --to …")
-    return resolve_model(word or f"{revised}:revised_model")
+    return resolve_effects(resolve_model(word or f"{revised}:revised_model"), effects or [])
 
 
-def _robot(
-    run: Path, found: "Identified", model: str | None, to: Path, *, shows: bool
-) -> dict[str, Any]:
+def _robot(found: "Identified", model: Any, to: Path, *, shows: bool) -> dict[str, Any]:
     """Writes a robot's file; returns what to tell."""
     from npdr_ppl.engines.mujoco.export import module_name
     from npdr_ppl.posterior.robot_file import export_robot
 
     beside = to.with_name(f"{module_name(to.name)}.py")
-    robot = export_robot(_model(run, model), found, to.name)
+    robot = export_robot(model, found, to.name)
     if robot.needs_folder and to.resolve().parent != robot.folder.resolve():
         raise DataError(
             f"The robot's file refers to others, such as meshes; write the new one to "
@@ -155,7 +158,7 @@ def _ranges(run: Path, to: Path, num: int) -> dict[str, Any]:
 
 
 def _draws(
-    run: Path, found: "Identified", model: str | None, to: Path, kind: Kind, num: int
+    run: Path, found: "Identified", model: Callable[[], Any], to: Path, kind: Kind, num: int
 ) -> dict[str, Any]:
     """Writes a Python file for another simulator; returns what to tell."""
     from npdr_ppl.posterior.randomisation import for_gymnasium, for_isaac_lab
@@ -165,7 +168,7 @@ def _draws(
         raise DataError(f"{to.name} cannot be imported; choose a name such as my_robot.py.")
     drawn = run_draws(run, num)
     write = for_gymnasium if kind is Kind.GYMNASIUM else for_isaac_lab
-    made = write(_model(run, model), found, drawn, to.stem)
+    made = write(model(), found, drawn, to.stem)
     files = {to: made.text.encode()}
     if made.draws is not None:
         files[to.with_suffix(".npz")] = made.draws

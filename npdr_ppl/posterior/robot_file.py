@@ -99,7 +99,7 @@ def found_effect(name: str, port: str) -> Effect:
     if name not in effects():
         raise ModelError(
             f"The run has the effect {port}.{name}, which is not in the catalogue. If you have "
-            "its file, add it first, as in npdr effects --add learned_effect.py."
+            "its file, give it, as in --effect learned_effect.py:Class@port."
         )
     return effect_class(name)(port)
 

@@ -131,7 +131,10 @@ def test_a_discovery_is_exported_with_its_effects(fitted):
         (("fit", "arm_model.py:model", "--to", "arm.xml"), "arm.xml exists already"),
         (("fit", "arm_model.py:model", "--to", "arm.urdf"), "not made from a URDF file"),
         (("parts", "arm_model.py:model", "--to", "new.xml"), "no folder of a finished"),
-        (("own", "arm_model.py:model", "--to", "new.xml"), "as in npdr effects --add"),
+        (
+            ("own", "arm_model.py:model", "--to", "new.xml"),
+            "--effect learned_effect.py:Class@port",
+        ),
         (("other", "arm_model.py:model", "--to", "new.xml"), "give the model of the run"),
         (("fit", "pendulum", "--to", "new.xml"), "has no port 'shoulder_torque'"),
     ],
@@ -143,3 +146,70 @@ def test_bad_input_gives_one_sentence(fitted, monkeypatch, words, sentence):
     write_fit(folder / "own", {"kp": 44.0, "elbow_torque.learned_by_nobody.cubic": 0.1})
     code, _, err = run_for_module("export", *words)
     assert code == 2 and err.count("\n") == 1 and sentence in err
+
+
+OWN_EFFECT = '''
+import pyro.distributions as dist
+import torch
+from npdr_ppl.language.channels import Parameter
+from npdr_ppl.language.effects import ForceEffect
+
+
+class CubicDamping(ForceEffect):
+    """A law of the user's."""
+
+    id = "cubic_damping"
+    parameters = (Parameter("damping", "N m s³/rad³", 0.0),)
+
+    def default_priors(self, port):
+        return {"damping": dist.Normal(0.0, 1.0)}
+
+    def force(self, position, velocity, parameters, memory):
+        return -parameters["damping"] * velocity**3
+
+
+class Reporting(CubicDamping):
+    """A law that cannot be followed."""
+
+    id = "reporting"
+
+    def force(self, position, velocity, parameters, memory):
+        return -parameters["damping"] * float(velocity)
+'''
+
+
+@pytest.fixture
+def with_own_effect(fitted):
+    """The folder with a file of two effects, and a run for each."""
+    folder, _ = fitted
+    (folder / "own.py").write_text(OWN_EFFECT)
+    for name in ("cubic_damping", "reporting"):
+        site = f"shoulder_torque.{name}.damping"
+        write_fit(folder / name, {"kp": 44.0, site: 0.3})
+    return folder
+
+
+def test_the_law_of_an_own_file_is_written_as_numpy(with_own_effect, monkeypatch):
+    folder = with_own_effect
+    monkeypatch.chdir(folder)
+    own = ("--effect", "own.py:CubicDamping@shoulder_torque")
+    words = ("cubic_damping", "arm_model.py:model", "--to", "new.xml", *own)
+    code, text, err = run_for_module("export", *words)
+    assert code == 0, err
+    assert "not written" not in text
+    effects = runpy.run_path(str(folder / "new_effects.py"))
+    (law,) = effects["laws"](effects["VALUES"])
+    joint = effects["Joint"](position=0.1, velocity=2.0, time=0.0, step=0.001)
+    assert law.applied_force(joint) == pytest.approx(-0.3 * 8.0)
+    assert "torch" not in (folder / "new_effects.py").read_text()
+
+
+def test_an_own_law_that_cannot_be_followed_is_refused_by_name(with_own_effect, monkeypatch):
+    folder = with_own_effect
+    monkeypatch.chdir(folder)
+    own = ("--effect", "own.py:Reporting@shoulder_torque")
+    words = ("reporting", "arm_model.py:model", "--to", "new.xml", *own)
+    code, text, err = run_for_module("export", *words)
+    assert code == 0, err
+    assert "not written: shoulder_torque.reporting, because its law cannot be followed" in text
+    assert not (folder / "new_effects.py").exists()

@@ -5,9 +5,10 @@ from collections.abc import Collection, Mapping
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.mujoco.callbacks.python_file import LAWS, has_dry_friction
+from npdr_ppl.engines.mujoco.callbacks.python_file import has_dry_friction, law_of
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import ActionEffect, Effect, ForceEffect
 
 __all__ = ["file_assignments", "is_in_file", "why_not"]
@@ -44,9 +45,11 @@ def why_not(effect: Effect) -> str | None:
     Args:
         effect: An effect that the file cannot hold.
     """
-    if effect.id in LAWS:
-        return None
-    return REASONS.get(effect.id, "npdr export has no Python for this law")
+    try:
+        law_of(effect)
+    except ModelError as error:
+        return REASONS.get(effect.id, str(error))
+    return None
 
 
 def file_assignments(

@@ -68,6 +68,9 @@ class JointLaw:
     def begin(self, joint: Joint) -> None:
         """Advances the own state by a step, if the law needs dynamics."""
 
+    def finish(self, joint: Joint) -> None:
+        """Advances the own state to the next step, once the forces of this one are known."""
+
     def applied_force(self, joint: Joint) -> float:
         """Returns a force in N m or N."""
         return 0.0

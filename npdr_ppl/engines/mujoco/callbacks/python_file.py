@@ -4,12 +4,15 @@ import ast
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from npdr_ppl.engines.mujoco.callbacks import command_laws, joint_laws, runner, sensor_laws
+from npdr_ppl.engines.mujoco.callbacks.traced_laws import TracedLaw, trace
 from npdr_ppl.engines.mujoco.channels import Reading
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect, ForceEffect, SensorEffect
 from npdr_ppl.python_text import plain, quoted
 
@@ -19,6 +22,7 @@ __all__ = [
     "callback_file",
     "effects_class",
     "has_dry_friction",
+    "law_of",
     "python_source",
 ]
 
@@ -77,11 +81,52 @@ class CallbackFile:
     effects: tuple[str, ...]
 
 
+def law_of(effect: Effect) -> type | TracedLaw:
+    """Returns the class of an effect's law, or what writes it.
+
+    Args:
+        effect: An effect of the catalogue, of a user's file, or with a learned law.
+
+    Raises:
+        ModelError: There is no Python for it; the message says why, without a full stop.
+    """
+    is_ours = type(effect).__module__.partition(".")[0] == __name__.partition(".")[0]
+    if not is_ours:
+        return trace(effect)
+    if effect.id not in LAWS:
+        raise ModelError("npdr export has no Python for this law")
+    return LAWS[effect.id]
+
+
 def has_dry_friction(effect: Effect) -> bool:
     """Returns whether an effect's law has a bound of dry friction."""
-    law = LAWS.get(effect.id, joint_laws.JointLaw)
+    try:
+        law = law_of(effect)
+    except ModelError:
+        return False
+    if isinstance(law, TracedLaw):
+        return law.has_dry_friction
     own = getattr(law, "dry_friction", None)
     return own is not None and own is not joint_laws.JointLaw.dry_friction
+
+
+def _class_names(effects: Sequence[Effect]) -> dict[str, str]:
+    """Returns the name of each effect's class in the file, by the effect's name.
+
+    Effects share a class if their laws are the same. Other classes of one name get numbers.
+    """
+    texts = {name: "" for name in _pieces()}  # no law may replace a class of ours
+    result: dict[str, str] = {}
+    for effect in effects:
+        law = law_of(effect)
+        if isinstance(law, TracedLaw):
+            names = (f"{law.name}{number or ''}" for number in (0, *range(2, 2 + len(texts))))
+            name = next(n for n in names if texts.get(n, law.text) == law.text)
+            texts[name] = law.text
+        else:
+            name = law.__name__
+        result[effect.name] = name
+    return result
 
 
 def _law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[str]:
@@ -92,12 +137,14 @@ def _law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[st
         effects: Effects with a law.
     """
     lines = []
+    names = _class_names(effects)
     for effect in effects:
         given = [f"{p.name}=values[{quoted(s)}]," for p, s in _parameters(effect)]
-        given += [f"{name}={value!r}," for name, value in effect.constants.items()]
+        if not isinstance(law_of(effect), TracedLaw):
+            given += [f"{name}={value!r}," for name, value in effect.constants.items()]
         for place in _places(simulator, effect):
             inside = "\n    ".join([f"{quoted(place)},", *given])
-            lines.append(f"{LAWS[effect.id].__name__}(\n    {inside}\n)")
+            lines.append(f"{names[effect.name]}(\n    {inside}\n)")
     return lines
 
 
@@ -142,8 +189,19 @@ def python_source(root: str, effects: Sequence[Effect]) -> tuple[str, list[str]]
         root: Name of the class.
         effects: Effects with a law. With effects, the source has what takes the steps.
     """
-    laws = {LAWS[effect.id].__name__ for effect in effects}
-    code = _code({root, *laws, *([runner.LawRunner.__name__] if laws else [])})
+    wanted = {root, *([runner.LawRunner.__name__] if effects else [])}
+    written: dict[str, str] = {}
+    for effect in effects:
+        law, name = law_of(effect), _class_names(effects)[effect.name]
+        if isinstance(law, TracedLaw):
+            wanted.add(law.base)
+            written[name] = f"@dataclass\nclass {name}({law.base}):\n{law.text}\n"
+        else:
+            wanted.add(name)
+    code = _code(wanted)
+    if written:
+        code = "\n\n\n".join([code.rstrip("\n"), *(t.rstrip("\n") for t in written.values())])
+        code += "\n\n\n"
     return code, _imports(code)
 
 
@@ -205,8 +263,9 @@ def _places(simulator: MujocoMechanism, effect: Effect) -> list[str | int]:
     return [model.actuator(number).name or number for number in numbers]
 
 
-def _code(wanted: set[str]) -> str:
-    """Returns the source of some classes, and of everything that they use, in order."""
+@cache
+def _pieces() -> dict[str, tuple[str, set[str]]]:
+    """Returns the source of each class of this folder, and the names that it uses."""
     pieces: dict[str, tuple[str, set[str]]] = {}
     for module in _SOURCES:
         source = Path(__file__).with_name(module).read_text(encoding="utf-8")
@@ -224,7 +283,12 @@ def _code(wanted: set[str]) -> str:
             text = "\n".join(lines[first - 1 : last.end_lineno])
             used = {n.id for n in ast.walk(node) if isinstance(n, ast.Name)} - {name}
             pieces[name] = text, used
-    kept = set(wanted)
+    return pieces
+
+
+def _code(wanted: set[str]) -> str:
+    """Returns the source of some classes, and of everything that they use, in order."""
+    pieces, kept = _pieces(), set(wanted)
     while more := {u for name in kept for u in pieces[name][1] if u in pieces} - kept:
         kept |= more
     return "\n\n\n".join(text for name, (text, _) in pieces.items() if name in kept) + "\n\n"

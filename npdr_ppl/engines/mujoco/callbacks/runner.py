@@ -136,6 +136,7 @@ class LawRunner:
         for (law, _, dof), joint in zip(self.forces, joints, strict=True):
             applied[dof] += law.applied_force(joint)
             self.friction[dof] += law.dry_friction(joint)
+            law.finish(joint)
         mujoco.mj_step(model, data)
         for dof, bound in own_friction:
             self.friction[dof] = bound
