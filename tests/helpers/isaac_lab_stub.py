@@ -1,7 +1,8 @@
 """The names of Isaac Lab that a configuration of events uses, with the arguments they take.
 
-The arguments are those of ``isaaclab/envs/mdp/events.py`` of 2025. Isaac Lab itself needs Isaac
-Sim and a GPU.
+The arguments are those of ``isaaclab/envs/mdp/events.py`` of the versions 2.3.2 and 3.0.0, which
+are the same. ``benchmarks/isaac_lab.py`` compares an exported file with the wheel of any version.
+Isaac Lab itself needs Isaac Sim and a GPU.
 """
 
 import inspect
@@ -36,14 +37,14 @@ TERMS = {
         "armature_distribution_params": None,
         "lower_limit_distribution_params": None,
         "upper_limit_distribution_params": None,
-        "operation": "abs",
+        "operation": REQUIRED,
         "distribution": "uniform",
     },
     "randomize_actuator_gains": {
         "asset_cfg": REQUIRED,
         "stiffness_distribution_params": None,
         "damping_distribution_params": None,
-        "operation": "abs",
+        "operation": REQUIRED,
         "distribution": "uniform",
     },
     "randomize_physics_scene_gravity": {
@@ -52,7 +53,8 @@ TERMS = {
         "distribution": "uniform",
     },
 }
-"""The arguments of each term, behind the environment and its numbers, with their defaults."""
+"""The arguments of each term, behind the environment and its numbers, with their defaults. The
+terms of joints and gains read ``operation`` when they are made, before their default applies."""
 
 
 @dataclass

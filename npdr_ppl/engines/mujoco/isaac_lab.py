@@ -3,7 +3,8 @@
 The terms are those of ``isaaclab.envs.mdp``: ``randomize_rigid_body_mass``,
 ``randomize_rigid_body_com``, ``randomize_rigid_body_material``, ``randomize_joint_parameters``,
 ``randomize_actuator_gains`` and ``randomize_physics_scene_gravity``. They draw each number by
-itself, uniformly, so correlations are lost.
+itself, uniformly, so correlations are lost. Names and arguments are those of Isaac Lab 2.3.2 and
+3.0.0; ``benchmarks/isaac_lab.py`` compares them with another version.
 """
 
 import re
@@ -138,7 +139,8 @@ def _centre(body: str) -> _Term:
 def _joint(joint: str) -> _Term:
     note = (
         "PhysX 5.6 takes friction as an effort in N m or N, earlier ones as a coefficient. "
-        "Isaac Lab sets static, dynamic and viscous friction from this range."
+        "With PhysX, static, dynamic and viscous friction are drawn from this range; Newton has "
+        "static friction only."
     )
     return _Term(
         "randomize_joint_parameters",
@@ -180,7 +182,7 @@ def _gravity(model: Any, columns: Mapping[Field, Array]) -> _Term:
         "reset",
         None,
         {"gravity_distribution_params": f"({low!r}, {high!r})", "operation": '"abs"'},
-        "One gravity for all environments.",
+        "With PhysX one gravity for all environments, with Newton one for each.",
     )
 
 
