@@ -3,9 +3,9 @@
     python benchmarks/so101_arm.py --data ../shared/data/so101 --out so101_arm.json
 
 The six motions are every third one in the order of the alphabet. The model is the arm's MJCF file
-in a :class:`~npdr_ppl.MujocoSimulator` with all six joints. Of each servo, kp, kv (with the damping
-of its joint), armature and dry friction are fitted, and what ``--laws`` adds. Masses stay those of
-the file, whose weight sets the scale of all torques.
+in a :class:`~npdr_ppl.MujocoSimulator` with all six joints. Of each servo, kp, kv (with the
+damping of its joint), armature and dry friction are fitted, and what ``--laws`` adds. Masses stay
+those of the file, whose weight sets the scale of all torques.
 
 Behind stiff servos the joints nearly decouple: another kp of the wrist hardly moves the shoulder.
 Each Gauss-Newton step therefore changes the same number of all six servos in one simulation, and

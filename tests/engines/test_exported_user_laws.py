@@ -6,6 +6,7 @@ import torch
 
 from npdr_ppl.discovery.learning.formulas import effects_of
 from npdr_ppl.discovery.learning.law import Law
+from npdr_ppl.discovery.learning.memory import DELAY
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.terms import terms_at
 from npdr_ppl.engines.mujoco import MujocoSimulator
@@ -49,8 +50,8 @@ def motion(simulator, name):
         "sensor": {"y": swing["q"]},
     }.get(port.kind, {"u": swing["q"]})
     units = {"q": "rad", "v": "rad/s", "tau": "N m", "u": port.unit, "y": port.unit, "t": "s"}
-    edges = torch.tensor([0, 100])
-    return PortMotion(port, {**values, "t": time}, units, None, edges)
+    edges, past = torch.tensor([0, 100]), torch.zeros(1, 0, dtype=torch.float64)
+    return PortMotion(port, {**values, "t": time}, units, None, edges, 0.01, past, 0.01)
 
 
 def learned(simulator, name, terms):
@@ -80,6 +81,8 @@ def kinds_of_terms(simulator, name):
     """One term of every form, whatever the constants inside of it."""
     found = {}
     for term in terms_at(motion(simulator, name)):
+        if term.memory == DELAY:
+            continue  # refused by name: it needs earlier commands
         found[term.columns[:2], term.is_dry, term.is_spline] = term
     # Waves with other numbers of periods have the same form.
     forms = {}
@@ -232,7 +235,7 @@ class SoftServo(ServoEffect):
         """Wide."""
         return {"width": dist.Uniform(0.0, 1.0)}
 
-    def act(self, error, parameters):
+    def act(self, error, parameters, memory):
         """Weakens small errors."""
         return error * error.abs() / (error.abs() + parameters["width"])
 

@@ -140,6 +140,8 @@ def _leaves(memory: Any) -> list[Any]:
         return []
     if isinstance(memory, tuple | list):
         return [leaf for part in memory for leaf in _leaves(part)]
+    if isinstance(memory, dict):
+        return [leaf for name in sorted(memory) for leaf in _leaves(memory[name])]
     return [memory]
 
 
@@ -150,6 +152,8 @@ def _rebuilt(memory: Any, make: Callable[[], Any]) -> Any:
         parts = [_rebuilt(part, make) for part in memory]
         is_named = hasattr(memory, "_fields")
         return type(memory)(*parts) if is_named else type(memory)(parts)
+    if isinstance(memory, dict):
+        return {name: _rebuilt(memory[name], make) for name in sorted(memory)}
     return make()
 
 
@@ -240,10 +244,24 @@ def _action(effect: ActionEffect) -> TracedLaw:
 
 def _servo(effect: ServoEffect) -> TracedLaw:
     recorder = Recorder()
-    found = effect.act(recorder.number("error"), _parameters(effect, recorder))
-    lines = ["", "    def act(self, error: float) -> float:"]
+    own, error = _parameters(effect, recorder), recorder.number("error")
+    memory = _Memory(effect.initial_memory(error))
+    acted = effect.act(error, own, memory.stand_ins(recorder))
+    lines: list[str] = []
+    if memory.leaves:
+        lines += _MEMORY
+        lines += ["", "    def reset(self) -> None:"]
+        lines += ['        """Sets the state as a rollout begins, with no error."""']
+        lines += _setting(recorder, memory.leaves, _AT_REST)
+    lines += ["", "    def act(self, error: float, step: float) -> float:"]
     lines += ['        """Returns the error on which the servo acts."""']
-    lines += _returning(recorder, [found], {"error": "np.float64(error)"})
+    step: Any = recorder.number("step")
+    later = effect.next_memory(error, own, memory.stand_ins(recorder), step)
+    statements, texts = _statements(recorder, [acted, *memory.leaves_of(later)], _OF_ERROR)
+    lines += [*statements, f"        acted = {texts[0]}"]
+    if memory.leaves:
+        lines += _assigned("self.memory", texts[1:])
+    lines += ["        return float(acted)"]
     return TracedLaw(type(effect).__name__, "ServoLaw", _class_body(effect, lines))
 
 
@@ -290,6 +308,8 @@ _OF_JOINT = {
 }
 _OF_COMMAND = {"start": "0.0", "command": "np.float64(command)"}
 _OF_VALUE = {"start": "0.0", "value": "np.float64(value)"}
+_OF_ERROR = {"error": "np.float64(error)"}
+_AT_REST = {"error": "np.float64(0.0)"}
 """Where each input of a law comes from, in the file."""
 
 
