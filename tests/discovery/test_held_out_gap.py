@@ -216,3 +216,12 @@ def test_other_parameters_keep_their_values(switched_on_twice):
     sites = {site.name: site.coordinates for site in after.segments.prior.sites}
     for name, coordinates in sites.items():
         assert bool((anew.shifts[:, coordinates] != 0.0).all()) == ("encoder_bias" in name)
+
+
+def test_noise_is_that_of_the_other_half(switched_on_twice):
+    _, after, held_out, options = switched_on_twice
+    anew = estimated_anew(after, held_out, options)
+    assert anew is not None
+    anew = replace(anew, scales=torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
+    noise = anew.noise_of(torch.tensor([False, True]))
+    assert noise.tolist() == [[[3.0, 4.0]], [[1.0, 2.0]]]

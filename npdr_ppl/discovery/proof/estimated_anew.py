@@ -36,11 +36,14 @@ class EstimatedAnew:
     Attributes:
         shifts: Changes of the reference coordinates for the first half of the segments and for the
             second, ``(2, d)``; zero in the coordinates of all other parameters.
+        scales: Root-mean-square residual of each channel in the first half and in the second,
+            ``(2, C)``. A filter that is set differently lets another share of the noise pass.
         values: For each such parameter, its value in the recording that was searched, and in the
             first and the second half of the held-out one, by site.
     """
 
     shifts: Tensor
+    scales: Tensor
     values: Mapping[str, tuple[float, float, float]]
 
     def simulate(self, segments: SegmentModel, z: Tensor, offsets: Tensor, late: Tensor) -> Tensor:
@@ -53,7 +56,8 @@ class EstimatedAnew:
             late: Whether each segment is in the second half, ``(S,)``.
         """
         parts = self._by_half(
-            late, lambda index, shift: segments.along(index).simulate(z + shift, offsets[:, index])
+            late,
+            lambda index, shift, _: segments.along(index).simulate(z + shift, offsets[:, index]),
         )
         return _joined(parts, late, dim=1)
 
@@ -63,8 +67,8 @@ class EstimatedAnew:
         """Returns rough derivatives at the shifted parameters; see :meth:`simulate`."""
         parts = self._by_half(
             late,
-            lambda index, shift: segments.along(index).linearise(
-                fit.z + shift, offsets[index], fit.scale, is_rough=True
+            lambda index, shift, scale: segments.along(index).linearise(
+                fit.z + shift, offsets[index], scale, is_rough=True
             ),
         )
         return Linearisation(
@@ -74,16 +78,28 @@ class EstimatedAnew:
             )
         )
 
+    def noise_of(self, late: Tensor) -> Tensor:
+        """Returns the scale of each segment's residuals in the other half, ``(S, 1, C)``.
+
+        Args:
+            late: Whether each segment is in the second half, ``(S,)``.
+        """
+        return self.scales[(~late).long()][:, None]
+
     def to_dict(self) -> dict[str, dict[str, float]]:
         """Returns JSON-serialisable values."""
         return {site: dict(zip(ANEW, own, strict=True)) for site, own in self.values.items()}
 
     def _by_half(
-        self, late: Tensor, made: Callable[[Tensor, Tensor], Any]
+        self, late: Tensor, made: Callable[[Tensor, Tensor, Tensor], Any]
     ) -> list[tuple[Tensor, Any]]:
         """Returns what is made of each half's segments with the values of the other half."""
-        halves = ((~late).nonzero()[:, 0], self.shifts[1]), (late.nonzero()[:, 0], self.shifts[0])
-        return [(index, made(index, shift)) for index, shift in halves if len(index)]
+        halves = ((~late).nonzero()[:, 0], 1), (late.nonzero()[:, 0], 0)
+        return [
+            (index, made(index, self.shifts[other], self.scales[other]))
+            for index, other in halves
+            if len(index)
+        ]
 
 
 def estimated_anew(
@@ -116,18 +132,20 @@ def estimated_anew(
         held[coordinates] = False
     try:
         found = [
-            fit_segments(segments.along(index), z, held=held).z
+            fit_segments(segments.along(index), z, held=held)
             for index in torch.arange(num).tensor_split(2)
         ]
     except DataError:
         return None
-    every = [segments.prior.to_parameters(each[None]) for each in (z, *found)]
+    fitted = [fit.z for fit in found]
+    every = [segments.prior.to_parameters(each[None]) for each in (z, *fitted)]
     values = {
         site: (first, second, third)
         for site in own
         for first, second, third in [[float(each[site].flatten()[0]) for each in every]]
     }
-    return EstimatedAnew(torch.stack(found) - z, values)
+    scales = torch.stack([fit.scale.double() for fit in found])
+    return EstimatedAnew(torch.stack(fitted) - z, scales, values)
 
 
 def _joined(parts: list[tuple[Tensor, Tensor]], late: Tensor, dim: int) -> Tensor:

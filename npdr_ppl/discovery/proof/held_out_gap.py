@@ -234,7 +234,8 @@ class _Simulated:
         shape = len(self.drawn), *self.part.no_offsets.shape
         offsets = self._start_factors() * torch.randn(shape, dtype=torch.float64)
         draws = self._simulate(self.part, self.drawn, offsets, self.used)
-        return draws + self.fit.scale * torch.randn(draws.shape, dtype=torch.float64)
+        scale = self.fit.scale if self.anew is None else self.anew.noise_of(self._late(self.used))
+        return draws + scale * torch.randn(draws.shape, dtype=torch.float64)
 
 
 def _crps(draws: Tensor, observed: Tensor, mask: Tensor) -> float:
