@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.search.parts import found_in_parts
+from npdr_ppl.discovery.search.parts import found_in_parts, missing_where
 from npdr_ppl.discovery.search.repeatability import HALVES
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.verdict import judge, most_doubtful
@@ -98,3 +98,11 @@ def test_without_repetition_no_parts_are_compared():
     search = npdr.DiscoveryOptions(effects=EFFECTS, repeat=False)
     found = npdr.discover(pendulum, swinging(rollouts=2, friction=0.2), search=search)
     assert found.effects[0].found_in == ()
+
+
+def test_where_an_effect_is_missing_is_said_in_a_few_words():
+    parts = dict.fromkeys((*HALVES, "all but rollout 0"), True)
+    first, second = HALVES
+    assert missing_where(parts | {second: False}) == second
+    assert missing_where(parts | {"all but rollout 0": False}) == "all but rollout 0"
+    assert missing_where(dict.fromkeys(parts, False)) == "either half"

@@ -27,7 +27,7 @@ from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.alternatives import Added, probabilities
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.parsimony import overlap
-from npdr_ppl.discovery.search.repeatability import halves
+from npdr_ppl.discovery.search.repeatability import HALVES, halves
 from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE, REPEATABILITY, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
@@ -102,7 +102,7 @@ def missing_where(in_parts: Mapping[str, bool]) -> str:
         in_parts: Whether it was found in each part, by the part's name.
     """
     missed = [name for name, is_in in in_parts.items() if not is_in]
-    return missed[0] if len(missed) == 1 or len(in_parts) > 2 else "either half"
+    return "either half" if set(HALVES) <= set(missed) else missed[0]
 
 
 def _parts(hypothesis: Hypothesis) -> Iterator[tuple[str, Tensor]]:
@@ -174,7 +174,7 @@ class _Compared:
         weights = probabilities(laws, without, self._is_approximate)
         likeliest = max(weights, key=lambda name: weights[name])
         is_likely = weights[own] >= EVIDENCE.least_probability or self._is_same(likeliest, models)
-        is_found = against_none >= 0.5 and is_likely
+        is_found = against_none >= REPEATABILITY.least_probability and is_likely
         return PartResult(part, is_found, against_none, "" if is_likely else likeliest)
 
     def _is_same(self, name: str, models: Mapping[str, Hypothesis]) -> bool:

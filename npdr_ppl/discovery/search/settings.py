@@ -233,18 +233,22 @@ class RepeatabilitySettings:
             half.
         false_alarm_rate: Upper bound of the probability that a real effect is reported as not
             found again, if its law is right.
+        least_probability: Probability of an effect, against the model without it, from which a
+            part shows it. The whole recording has found it before, so the part need not overcome
+            the number of candidates.
         certain_probability: Probability of an effect in a part, after one Gauss-Newton step, from
             which fits of the part need not confirm it.
     """
 
     fewest_segments: int = 8
     false_alarm_rate: float = 1e-3
+    least_probability: float = 0.5
     certain_probability: float = 0.99
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 2, 1000, "fewest_segments")
-        check_range(self, 0.0, 1.0, "false_alarm_rate", "certain_probability")
+        check_range(self, 0.0, 1.0, "false_alarm_rate", "least_probability", "certain_probability")
 
 
 BASE_FIT = BaseFitSettings()
