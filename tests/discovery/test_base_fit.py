@@ -3,6 +3,7 @@
 from clean_fits_conditions import made
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.search import base_fit, effect_search
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.models.pendulum import pendulum
 
@@ -19,3 +20,22 @@ def test_steps_are_refined_until_parameters_do_not_compensate_for_them():
     assert best.simulator.with_finer_steps() is None
     deviation = best.likelihood.information().inverse().diagonal().sqrt()
     assert ((found.fit.z - best.fit.z).abs() < 0.5 * deviation).all()
+
+
+def test_a_rough_fit_is_fitted_to_convergence_once(monkeypatch):
+    finished, polished = [], base_fit.polished
+
+    def once(rough):
+        assert not any(rough is found for found in finished)
+        finished.append(polished(rough))
+        return finished[-1]
+
+    recording = made("pendulum", "clean", 1141).rollouts[[0, 1]]
+    searcher = Searcher(pendulum, recording, npdr.DiscoveryOptions())
+    given = searcher.fit_base(may_be_rough=True)
+    for module in (base_fit, effect_search):
+        monkeypatch.setattr(module, "polished", once)
+    # As where rough fits do not show which steps are likelier.
+    monkeypatch.setattr(base_fit, "_are_likelier", lambda one, other: False)
+    settled = searcher.settled(given)
+    assert len(finished) > 1 and any(settled is found for found in finished)

@@ -42,11 +42,14 @@ class BaseFit:
         segments: The model along the recording, with finer steps if its own are too coarse.
         hypothesis: Its closest fit.
         are_steps_coarse: Whether its own steps are too coarse for the recording.
+        is_polished: Whether a rough fit was fitted to convergence on the way; see
+            :func:`polished`.
     """
 
     segments: SegmentModel
     hypothesis: Hypothesis
     are_steps_coarse: bool
+    is_polished: bool = False
 
 
 def fit_base(
@@ -227,7 +230,7 @@ def in_finer_steps(
         is_rough: Whether a rough fit in finer steps is enough; see :func:`polished`.
         report: Called with a sentence when steps are refined.
     """
-    is_coarse, bases = False, [base]
+    is_coarse, is_polished, bases = False, False, [base]
     while (finer_base := _in_finer_steps(bases[-1])) is not None:
         bases.append(finer_base)
     while True:
@@ -251,16 +254,17 @@ def in_finer_steps(
         (finer,) = trials.fits([replace(asked, is_trial=is_rough)], current.simulator)
         if finer is not None and not is_rough:
             finer = off_the_ends(finer)
-        coarse = current
-        if finer is not None and is_rough and not _are_likelier(finer, coarse):
+        is_finer_polished = False
+        if finer is not None and is_rough and not _are_likelier(finer, current):
             # Rough fits do not show which is likelier.
-            coarse, finer = polished(coarse), polished(finer)
-        if finer is None or _are_likelier(coarse, finer):
+            current = current if is_polished else polished(current)
+            finer, is_polished, is_finer_polished = polished(finer), True, True
+        if finer is None or _are_likelier(current, finer):
             break
         report("the model's integration steps are too coarse for this recording; refining them")
-        is_coarse, bases = True, bases[number:]
+        is_coarse, is_polished, bases = True, is_finer_polished, bases[number:]
         current, near = finer if is_rough else trials.with_own_starts(finer), None
-    return BaseFit(bases[0], current, is_coarse)
+    return BaseFit(bases[0], current, is_coarse, is_polished)
 
 
 def _searched(segments: SegmentModel, seed: int, progress: Step | None) -> Mapping[str, Tensor]:

@@ -156,7 +156,8 @@ class Searcher:
             current, self.base, near=near, is_rough=is_rough, report=self._report
         )
         self.base = found.segments
-        self._is_rough = is_rough and (self._is_rough or found.hypothesis is not current)
+        is_new = found.hypothesis is not current
+        self._is_rough = is_rough and not found.is_polished and (self._is_rough or is_new)
         self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
         return found.hypothesis
 
