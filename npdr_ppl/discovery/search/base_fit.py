@@ -133,7 +133,8 @@ def _parameters_in_finer_steps(
         segments: The model along the same segments.
     """
     try:
-        found = in_finer_steps(fitted, segments, is_rough=True)
+        # The fit along all segments refines them further if necessary.
+        found = in_finer_steps(fitted, segments, is_rough=True, most_refinements=1)
     except DataError:
         return None
     return found.hypothesis.parameters if found.are_steps_coarse else None
@@ -215,6 +216,7 @@ def in_finer_steps(
     *,
     near: Mapping[str, Tensor] | None = None,
     is_rough: bool = False,
+    most_refinements: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> BaseFit:
     """Returns a fit with finer steps if the error of its own is noticeable; else unchanged.
@@ -228,12 +230,14 @@ def in_finer_steps(
         near: Parameters from which the first fit in finer steps begins; those of the hypothesis by
             default.
         is_rough: Whether a rough fit in finer steps is enough; see :func:`polished`.
+        most_refinements: Greatest number of times that steps are refined; until they are fine
+            enough by default.
         report: Called with a sentence when steps are refined.
     """
     is_coarse, is_polished, bases = False, False, [base]
     while (finer_base := _in_finer_steps(bases[-1])) is not None:
         bases.append(finer_base)
-    while True:
+    for _ in range(most_refinements or len(bases)):
         levels = [extended(each, current.effects, current.segments.starts) for each in bases]
         # The first steps that differ little from the finest. A higher order alone does not show
         # the errors of forces that are held during a step.
