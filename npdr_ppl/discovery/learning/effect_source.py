@@ -278,13 +278,12 @@ def _action_methods(law: Law) -> list[str]:
     now += [f"{indent}{name} = delayed(commands, p[{d}], seconds)" for name, d in own.items()]
     lines = ["", f"    memory_time = {max(times, key=float)}"]
     if delays:
-        longest = "torch.maximum" * (len(own) > 1)
-        longest += f"({', '.join(f'parameters[{d}]' for d in own.values())})"
+        longest = ", ".join(f"parameters[{d}].detach().max()" for d in own.values())
         lines += [
             "",
             "    def history(self, parameters, time_step):",
             '        """Returns the number of past commands in the longest delay."""',
-            f"{indent}longest = {longest}.detach().max()",
+            f"{indent}longest = max([{longest}])",
             f"{indent}return math.floor(float(longest) / time_step) + 2",
         ]
     if first:

@@ -256,8 +256,14 @@ class NormalEquations:
             tried: dict[tuple[int, ...], float] = {}
             for own in beam:
                 fixed = self._index(own)
+                # The device passes a command on once: it does not add two ways to be late.
+                has_one = any(self.terms[k].is_late_command for k in own)
                 for width in widths.unique():
-                    new = [k for k in (widths == width).nonzero()[:, 0].tolist() if k not in own]
+                    new = [
+                        k
+                        for k in (widths == width).nonzero()[:, 0].tolist()
+                        if k not in own and not (has_one and self.terms[k].is_late_command)
+                    ]
                     if not new:
                         continue
                     gains = self._gains(information, score, fixed, new, int(width))

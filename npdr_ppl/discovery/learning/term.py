@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.learning.expressions import evaluated
-from npdr_ppl.discovery.learning.memory import Memory
+from npdr_ppl.discovery.learning.memory import CommandMemory, Delay, Memory
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 
 __all__ = ["HISTORY", "Shape", "Term", "symbol_of"]
@@ -69,6 +69,11 @@ class Term:
     is_spline: bool = False
     memory: Memory | None = None
     cost: float = field(default=1.0)
+
+    @property
+    def is_late_command(self) -> bool:
+        """Whether it stands for a command that arrives late: a delay, a lag or a resonance."""
+        return isinstance(self.memory, CommandMemory | Delay)
 
     def depends_on(self, variable: str) -> bool:
         """Returns whether it depends on a variable, by symbol, or on the ``"history"``."""
