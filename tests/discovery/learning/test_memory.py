@@ -1,10 +1,14 @@
 """Laws that remember: the same in the file as along the motion, and what they remember."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from hidden_rigs import make_case, under_test
 
+from npdr_ppl.cli.effect_words import named_effects
+from npdr_ppl.discovery.learning.effect_source import module_source
 from npdr_ppl.discovery.learning.expressions import (
     bent,
     bent_unevenly,
@@ -169,3 +173,38 @@ def test_waves_in_time_have_their_frequencies_and_are_half_a_period_apart():
     sine, cosine = waves[3].values(JOINT).unbind(-1)
     angle = 2.0 * math.pi * frequencies[3] * JOINT.values["t"]
     assert torch.allclose(sine, angle.sin()) and torch.allclose(cosine, angle.cos())
+
+
+def file_with(motion, tmp_path, *symbols):
+    terms = {term.memory.symbol: term for term in remembering(motion)}
+    law = law_with(motion, *(terms[symbol] for symbol in symbols))
+    path = tmp_path / "learned_effect.py"
+    path.write_text(module_source([law], "From a test."), encoding="utf-8")
+    return path
+
+
+def test_a_file_with_states_is_an_effect_for_every_command(tmp_path):
+    path = file_with(JOINT, tmp_path, "bend", "stretch")
+    (effect,) = named_effects([f"{path}@hinge"])
+    inputs = make_case("pendulum", "null", seed=5).fit.inputs(20)
+    simulator = under_test.pendulum_simulator().with_effects(effect)
+    c1 = torch.tensor([0.0, 0.3], dtype=torch.float64)
+    still = {f"hinge.{effect.id}.c2": torch.zeros(()), f"hinge.{effect.id}.c1": c1}
+    none, some = simulator.simulate(still, inputs)
+    assert torch.equal(none, under_test.pendulum_simulator().simulate({}, inputs))
+    unknown = simulator.simulate(still, replace(inputs, recorded=None))[1]
+    # Later segments begin with the bend that the motion before them left.
+    differs = (some - unknown).abs().amax((1, 2)) > 0.0
+    assert not differs[inputs.start == 0].any() and bool(differs.any())
+
+
+def test_a_file_with_states_of_a_command_is_an_effect_for_every_command(tmp_path):
+    path = file_with(COMMAND, tmp_path, "ring", "late")
+    (effect,) = named_effects([f"{path}:LearnedHinge@torque"])
+    inputs = make_case("pendulum", "null", seed=5).fit.inputs(20)
+    simulator = under_test.pendulum_simulator().with_effects(effect)
+    silent = {f"torque.{effect.id}.c{k}": torch.zeros(2) for k in (1, 2)}
+    base = under_test.pendulum_simulator().simulate({}, inputs)
+    assert torch.equal(simulator.simulate(silent, inputs)[0], base)
+    ringing = simulator.simulate({**silent, f"torque.{effect.id}.c1": torch.ones(2)}, inputs)
+    assert bool(ringing.isfinite().all()) and not torch.equal(ringing[0], base)
