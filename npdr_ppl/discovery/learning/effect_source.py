@@ -227,6 +227,7 @@ def _force_memory(law: Law, given: Sequence[str]) -> list[str]:
         given: Variables that each step's beginning gives.
     """
     uses, states = law.uses, _remembered(law, MotionMemory)
+    needs_time = any("seconds" in memory.later for _, _, memory in states)
     indent = "        "
     first = {"t": "start.time + 0.5 * start.time_step"} if "t" in uses else {}
     later = {"t": 'memory["t"] + time_step'} if "t" in uses else {}
@@ -238,7 +239,8 @@ def _force_memory(law: Law, given: Sequence[str]) -> list[str]:
         '        """Returns the memory at a segment\'s start; t is in the middle of a step."""',
     ]
     if states:
-        lines.append(f"{indent}p, seconds = start.parameters, start.interval")
+        lines.append(f"{indent}p = start.parameters")
+        lines += [f"{indent}seconds = start.interval"] * needs_time
         lines += [f"{indent}{name} = torch.zeros_like(position)" for _, name, _ in states]
         lines.append(f"{indent}for moved in start.displacements:")
         lines += [f"{indent}    {name} = {_own(law, n, m.later)}" for n, name, m in states]
@@ -250,7 +252,8 @@ def _force_memory(law: Law, given: Sequence[str]) -> list[str]:
         '        """Returns the memory one step later."""',
     ]
     if states:
-        lines.append(f"{indent}p, seconds = parameters, time_step")
+        lines.append(f"{indent}p = parameters")
+        lines += [f"{indent}seconds = time_step"] * needs_time
         lines.append(f'{indent}moved = position - memory["q"]')
         for number, name, memory in states:
             lines.append(f'{indent}{name} = memory["{name}"]')
@@ -298,7 +301,8 @@ def _action_methods(law: Law) -> list[str]:
         "",
         "    def act(self, commands, parameters, memory, time_step):",
         '        """Returns the changed command, and the memory one step later."""',
-        "        u, p, seconds = commands.now(), parameters, time_step",
+        "        u, p = commands.now(), parameters",
+        *(["        seconds = time_step"] if states or delays else []),
         *known,
         *(_entries(indent, "later =", later) if first else [f"{indent}later = None"]),
         *now,
