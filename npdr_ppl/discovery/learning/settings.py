@@ -39,8 +39,8 @@ class LearningSettings:
         shortest_relaxation: Least time constant of a relaxation that is tried, in steps. Shorter
             ones are damping.
         damping: Damping ratio of a resonance that is tried first, that of a metal gear.
-        longest_lag: Longest lag and delay of a command that are tried, in steps. Control loops
-            with longer ones are not used.
+        longest_lag: Longest lag and delay of a command that are tried, in steps. Working control
+            loops have shorter ones.
         most_frequencies: Greatest number of frequencies at which a wave in time is looked for.
         num_resonances: Number of time constants of a resonance that are tried. They are a few
             percent apart, as wide as the peak of a resonance with a damping ratio of 0.05.

@@ -86,7 +86,7 @@ def series_at(motion: PortMotion) -> list[Term]:
         motion: The motion at the port.
     """
     if motion.port.kind == "force":
-        # A fast recording cannot tell frequencies apart that differ by less than half a period.
+        # A rollout cannot tell waves apart that differ by less than half a period in all.
         longest = float(motion.values["t"].max())
         width = float((motion.edges[1:] - motion.edges[:-1]).min()) * motion.time_step
         most = min(LEARNING.most_frequencies, int(longest / width))
