@@ -3,9 +3,9 @@
     python benchmarks/so101_arm.py --data ../shared/data/so101 --out so101_arm.json
 
 The six motions are every third one in the order of the alphabet. The model is the arm's MJCF file
-in a :class:`~npdr_ppl.MujocoSimulator` with all six joints. Of each servo, kp, kv (with the
-damping of its joint), armature and dry friction are fitted, and what ``--laws`` adds. Masses stay
-those of the file, whose weight sets the scale of all torques.
+in MuJoCo with all six joints. Of each servo, kp, kv (with the damping of its joint), armature and
+dry friction are fitted, and what ``--laws`` adds. Masses stay those of the file, whose weight sets
+the scale of all torques.
 
 Behind stiff servos the joints nearly decouple: another kp of the wrist hardly moves the shoulder.
 Each Gauss-Newton step therefore changes the same number of all six servos in one simulation, and
@@ -226,12 +226,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data/so101"))
     parser.add_argument("--laws", default="delay", help="of " + ", ".join(LAWS))
     parser.add_argument("--rounds", type=int, default=8)
+    parser.add_argument("--every", type=int, default=1, help="fit every n-th of the 14 motions")
     parser.add_argument("--out", type=Path, default=Path("so101_arm.json"))
     arguments = parser.parse_args()
     names = sorted(path.stem for path in arguments.data.glob("*.parquet"))
     held_out = names[2::3]
     arm = Arm(arguments.data / "so101.xml", [law for law in arguments.laws.split(",") if law])
-    train = motions(arguments.data, [name for name in names if name not in held_out])
+    fit = [name for name in names if name not in held_out][:: arguments.every]
+    train = motions(arguments.data, fit)
     test = motions(arguments.data, held_out)
     begun = time.process_time()
     values = fitted(arm, train, arguments.rounds)
