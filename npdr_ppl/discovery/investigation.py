@@ -126,7 +126,7 @@ class Investigation:
     def _repair(self) -> Repair:
         with self._stage("check data"):
             self.progress.say("checking the recording")
-            found = repair(self.model, self.recorded, self._data_options)
+            found = repair(self.model, self.recorded, self._data_options, report=self.progress.say)
         simulator = found.simulator
         for effect in self.settings.effects or ():
             # Screening skips effects that the simulator cannot have; requested ones raise errors.

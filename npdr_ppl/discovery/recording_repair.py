@@ -75,13 +75,20 @@ class Repair:
         return other
 
 
-def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
+def repair(
+    model: Model,
+    rollouts: Rollouts,
+    options: DataOptions,
+    *,
+    report: Callable[[str], None] = lambda status: None,
+) -> Repair:
     """Returns a recording that is ready to be fitted.
 
     Args:
         model: A Pyro model with one simulator.
         rollouts: The recording.
         options: How it is cut into segments.
+        report: Called with a short status before each long step.
 
     Raises:
         DataError: The recording does not fit the model, or nothing usable is left of it.
@@ -113,7 +120,7 @@ def repair(model: Model, rollouts: Rollouts, options: DataOptions) -> Repair:
         tried = Prior(model, (options.with_certain_start().inputs(rollouts),))
         tried.execute(tried.sample(2))
     while len(applied) < REPAIR.most_remedies:
-        remedy = _remedy_for(model, rollouts, options)
+        remedy = _remedy_for(model, rollouts, options, report)
         if remedy is None:
             break
         applied.append(remedy)
@@ -162,17 +169,22 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
     return replace(rollouts, notes=(*rollouts.notes, *limited)) if limited else rollouts
 
 
-def _remedy_for(model: Model, rollouts: Rollouts, options: DataOptions) -> Remedy | None:
+def _remedy_for(
+    model: Model, rollouts: Rollouts, options: DataOptions, report: Callable[[str], None]
+) -> Remedy | None:
     """Returns the remedy that explains a recording best, if the recording is not explained."""
     windows = _Windows(rollouts, options)
+    report("checking the recording: a rough fit of it as it was read")
     as_read = windows.fitted(model, rollouts)
     if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
         # Before data are blamed, the parameters are searched for as thoroughly as for a fit.
+        report("checking the recording: a thorough fit, because the rough one leaves much")
         searched = _searched(as_read.segments)
         if searched is not None and _rms(_misfits(searched)) < _rms(_misfits(as_read)):
             as_read = searched
     if as_read is not None and _rms(_misfits(as_read)) < REPAIR.large_residual:
         return None
+    report("checking the recording: trying other units, signs and time stamps")
     trials = _Trials(model, rollouts, windows, as_read)
     present, ratio = trials.present, trials.ratio
     segments = SegmentModel(model, rollouts, options) if as_read is None else as_read.segments

@@ -195,7 +195,7 @@ def prepare(
     """
     step = progress or (lambda fraction, status: None)
     step(None, "check the recording")
-    repaired = repair(model, rollouts, options)
+    repaired = repair(model, rollouts, options, report=lambda status: step(None, status))
     rollouts = repaired.rollouts
     prior = Prior(model, (options.with_certain_start().inputs(rollouts),))
     is_declared = any(box.noise is not None for box in prior.black_boxes.values())
