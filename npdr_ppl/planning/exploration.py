@@ -64,8 +64,7 @@ def explore(
         known: The causes, at the time step of the limits.
         limits: What the robot may do.
         num_candidates: Greatest number of the best candidates that are returned, and of random
-            ones; ``None`` for as many as are judged in half a batch, since all of their segments
-            are judged next.
+            ones; ``None`` for :attr:`~npdr_ppl.planning.judging.Judge.most_shown`.
         rounds: Number of batches.
         time_limit: Seconds after which no further batch begins.
         seed: Seed of the search.
@@ -82,7 +81,7 @@ def explore(
     )
     if not found.pool:
         raise _nothing_found(known, judge, found)
-    most = num_candidates or max(1, judge.batch // 2)
+    most = num_candidates or judge.most_shown
     pool, random = found.pool[:most], found.random[:most]
     played = played_by(excitations, judge, [*pool, *random])
     return Explored(judge, found, played, len(pool))

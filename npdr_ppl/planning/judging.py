@@ -77,6 +77,8 @@ class Judge:
 
     Attributes:
         batch: Number of candidates that are judged together.
+        most_shown: Greatest number of candidates whose segments are all judged, in both directions
+            of every pair, for the best ones and for random ones.
         num_simulated: Number of simulations so far.
         failure: The last message of a simulator that failed; empty if none did.
     """
@@ -98,11 +100,14 @@ class Judge:
         self._boxes = [_box(cause, known.time_step) for cause in known.causes]
         self.num_simulated = 0
         self.failure = ""
-        self.batch, self._every = self._work()
+        self.batch, self._every, self.most_shown = self._work()
         self._start_errors: tuple[Array, ...] | None = None
 
-    def _work(self) -> tuple[int, int]:
-        """Returns how many candidates are judged together, and each how many-th segment is."""
+    def _work(self) -> tuple[int, int, int]:
+        """Returns how many candidates are judged together, each how many-th segment, and in full.
+
+        The last is how many may be judged with all segments at the end.
+        """
         num, limits = len(self.known.causes), self.limits
         comparisons = num if self.known.is_prior else num * (num - 1) // 2
         runs = 1 + max(len(cause.z) for cause in self.known.causes) + len(self.channels)
@@ -111,7 +116,7 @@ class Judge:
         most = max(1, num_segments // PLANNING.fewest_segments)
         every = min(most, -(-PLANNING.batch * steps // PLANNING.most_steps))
         batch = min(PLANNING.batch, max(2, every * PLANNING.most_steps // steps))
-        return batch, every
+        return batch, every, max(1, min(batch // 2, PLANNING.most_steps // steps))
 
     def _default_length(self) -> int:
         """Returns the steps of a segment with which one such recording would be cut."""

@@ -62,6 +62,14 @@ def test_a_cause_is_not_separated_from_itself(surviving):
     assert separations(judge, judge.played(*candidates(limits))) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_fewer_candidates_are_judged_if_each_takes_long(unrecorded):
+    known, limits = unrecorded
+    short, long = (
+        Judge(known, replace(limits, duration=seconds), seed=0) for seconds in (5.0, 2000.0)
+    )
+    assert short.most_shown > long.most_shown == 1
+
+
 @pytest.mark.slow
 def test_less_noise_separates_more(surviving):
     known, limits = surviving
