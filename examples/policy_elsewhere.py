@@ -63,6 +63,9 @@ def model(inputs):
     return npdr.simulate("trajectory", arm, given, inputs)
 """
 
+NUM_SEEDS = 3
+"""Searches of each kind; a search by chance is no result."""
+
 Policy = Callable[[float, float], float]
 """Returns a torque in N m for an angle in rad and a velocity in rad/s."""
 
@@ -203,21 +206,22 @@ def on_the_rig(rig: HiddenRig, policy: Policy, num_steps: int = 250) -> tuple[fl
     return -TIME_STEP * float((errors**2).sum()), float(np.sqrt((late**2).mean()))
 
 
-def identify(folder: Path, *options: str) -> Any:
+def identify(folder: Path, *options: str, num_steps: int = 600) -> Any:
     """Records the rig, finds what the robot's file lacks, and exports it; returns the wrapper.
 
     Args:
         folder: Where all files go.
         options: Further options of ``npdr discover``.
+        num_steps: Steps of each recorded rollout.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "robot.xml").write_text(ROBOT)
     (folder / "model.py").write_text(MODEL)
-    record(HiddenRig(), folder / "measured.csv")
+    record(HiddenRig(), folder / "measured.csv", num_steps=num_steps)
     found = ("discover", "model.py:model", "--data", "measured.csv", "--out", "found")
     npdr(*found, *options, folder=folder)
-    npdr("export", "found", "--to", "raise.py", "--as", "gymnasium", folder=folder)
-    return runpy.run_path(str(folder / "raise.py"))["RandomisedRobot"]
+    npdr("export", "found", "--to", "pendulum_gym.py", "--as", "gymnasium", folder=folder)
+    return runpy.run_path(str(folder / "pendulum_gym.py"))["RandomisedRobot"]
 
 
 def compare(folder: Path, wrapper: Any, **options: int) -> dict[str, tuple[float, float]]:
@@ -235,10 +239,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--out", type=Path, default=Path("elsewhere"))
     folder = parser.parse_args().out
-    reached = compare(folder, identify(folder))
-    print(f"\n{'policy':32}{'return':>10}{'late error':>12}")
-    for name, (total, error) in reached.items():
-        print(f"{name:32}{total:10.2f}{error:12.3f}")
+    wrapper = identify(folder)
+    print(f"\n{'seed':6}{'policy':32}{'return':>10}{'late error':>12}")
+    for seed in range(NUM_SEEDS):
+        for name, (total, error) in compare(folder, wrapper, seed=seed).items():
+            print(f"{seed:<6}{name:32}{total:10.2f}{error:12.3f}")
 
 
 if __name__ == "__main__":
