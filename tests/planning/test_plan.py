@@ -108,11 +108,17 @@ def test_every_cause_keeps_the_limits(planned, surviving):
     assert np.array_equal(played.readings[0, 0], recording.readings[0][1:])
 
 
-def test_a_plan_is_the_same_with_the_same_seed(planned, surviving):
-    again = plan_recording(*surviving, rollouts=1, rounds=8, seed=1)
-    assert again.recording == planned.recording
-    assert again.to_dict() == planned.to_dict()
-    assert plan_recording(*surviving, rounds=2, seed=2).recording != planned.recording
+def test_a_plan_is_the_same_with_the_same_seed(unrecorded):
+    one, again, other = (plan_recording(*unrecorded, rounds=5, seed=s) for s in (1, 1, 2))
+    assert again.recording == one.recording
+    assert again.to_dict() == one.to_dict()
+    assert other.recording != one.recording
+
+
+def test_a_plan_for_several_causes_is_the_same_with_the_same_seed(surviving):
+    one, again = (plan_recording(*surviving, rollouts=1, rounds=1, seed=1) for _ in range(2))
+    assert again.recording == one.recording
+    assert again.to_dict() == one.to_dict()
 
 
 def test_a_plan_from_the_prior_narrows_parameters(unrecorded):
