@@ -234,7 +234,7 @@ def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is
     shift = Shift(None, 1).remedy
     assert trials.ratio(shift) < recording_repair.REPAIR.remedy_factor
     assert trials.ratio_without(shift) < trials.ratio(shift)
-    assert recording_repair._remedy_for(pendulum, rollouts, options) is None
+    assert recording_repair._remedy_for(pendulum, rollouts, options, print) is None
 
 
 class Wheel(ODESimulator):
@@ -293,7 +293,7 @@ def test_a_remedy_that_leaves_much_must_beat_wider_priors(monkeypatch, wider, is
     monkeypatch.setattr(trials, "ratio_without", lambda trials, remedy: 1.0)
     monkeypatch.setattr(trials, "ratio_with_wider_priors", lambda trials, as_read: wider)
     options = npdr.DataOptions(None, 20)
-    found = recording_repair._remedy_for(wheel, turned(20.0, 1.0), options)
+    found = recording_repair._remedy_for(wheel, turned(20.0, 1.0), options, print)
     assert (found is not None) == is_applied
 
 

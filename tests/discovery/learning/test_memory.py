@@ -192,7 +192,7 @@ def test_a_file_with_states_is_an_effect_for_every_command(tmp_path):
     still = {f"hinge.{effect.id}.c2": torch.zeros(()), f"hinge.{effect.id}.c1": c1}
     none, some = simulator.simulate(still, inputs)
     assert torch.equal(none, under_test.pendulum_simulator().simulate({}, inputs))
-    unknown = simulator.simulate(still, replace(inputs, recorded=None))[1]
+    unknown = simulator.simulate(still, replace(inputs, recorded_readings=None))[1]
     # Later segments begin with the bend that the motion before them left.
     differs = (some - unknown).abs().amax((1, 2)) > 0.0
     assert not differs[inputs.start == 0].any() and bool(differs.any())
