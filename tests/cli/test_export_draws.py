@@ -175,6 +175,43 @@ def test_the_environment_moves_as_our_simulator_with_the_same_draw(draws):
         assert np.abs(wanted - nominal).max() > 0.1
 
 
+OWN_EFFECT = """
+import pyro.distributions as dist
+from npdr_ppl.language.channels import Parameter
+from npdr_ppl.language.effects import ForceEffect
+
+
+class CubicDamping(ForceEffect):
+    id = "cubic_damping"
+    parameters = (Parameter("damping", "N m s³/rad³", 0.0),)
+
+    def default_priors(self, port):
+        return {"damping": dist.Normal(0.0, 1.0)}
+
+    def force(self, position, velocity, parameters, memory):
+        return -parameters["damping"] * velocity**3
+"""
+
+
+def test_an_effect_of_ones_own_acts_in_the_environment_with_the_value_of_the_draw(draws):
+    Path("own.py").write_text(OWN_EFFECT)
+    site = "shoulder_torque.cubic_damping.damping"
+    names = ("mass", "damping", "kp", "centre", "density", "grip")
+    drawn = write_fit(Path("own"), {name: MEANS[name] for name in names} | {site: 0.5})
+    words = "export", "own", MODEL, "--effect", "own.py:CubicDamping@shoulder_torque"
+    code, _, err = run_for_module(*words, "--to", "own_gym.py", "--as", "gymnasium")
+    assert code == 0, err
+    wrapper = runpy.run_path("own_gym.py")["RandomisedRobot"]
+    env = wrapper(arm_environment())
+    _, info = env.reset(options={"draw": 11})
+    assert info["parameters"][site] == drawn[site][11]
+    data = env.unwrapped.data
+    data.qvel[0] = 2.0
+    env.unwrapped.frame_skip = 1
+    env.step(np.zeros(2))
+    assert data.qfrc_applied[0] == pytest.approx(-drawn[site][11] * 2.0**3)
+
+
 def episode(env, policy, seed, num_steps=150):
     """Returns the return of an episode."""
     observation, _ = env.reset(seed=seed)
