@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.search.parts import found_in_parts, missing_where
@@ -40,6 +41,16 @@ def test_an_effect_of_all_rollouts_is_found_in_both_halves():
         *HALVES,
         *(f"all but rollout {number}" for number in range(4)),
     ]
+
+
+def test_a_part_compares_models_with_the_same_initial_states():
+    """Models with other initial states have other residuals: the comparison would be wrong."""
+    search = npdr.DiscoveryOptions(effects=EFFECTS)
+    found = npdr.discover(pendulum, swinging(rollouts=3, friction=0.02), search=search)
+    models = list(found.search.trials.values())
+    assert len(models) >= 3
+    starts = [model.segments.inputs.initial_values for model in models]
+    assert all(torch.equal(own, starts[0]) for own in starts)
 
 
 def test_an_effect_of_one_half_only_is_not_named(rubbed_late):

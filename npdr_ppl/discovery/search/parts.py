@@ -126,7 +126,7 @@ class _Compared:
         self._effect, self._is_approximate = added.effect, search.is_approximate
         trials = {name: h for (place, name), h in search.trials.items() if place == added.place}
         self._without = trials.pop("", None)
-        self._trials = {added.effect.name: search.final} | trials
+        self._trials = trials
         self._fitting = added.fitting
         self._steps: dict[str, _Step | None] = {}
 

@@ -73,11 +73,12 @@ def with_rivals(
             else:
                 report(f"{effect.name}: probability {found.alternatives[effect.name]:.2f}")
             added.append(found)
-            others = {} if alternatives is None else alternatives.others
-            for name, trial in ({effect.name: asked} | others).items():
-                tried[effect.name, name] = trial
+            # Only models with the same initial states can be compared.
+            models = {effect.name: asked}
             if alternatives is not None:
-                tried[effect.name, ""] = alternatives.without
+                models = {effect.name: alternatives.with_it} | alternatives.others
+                models[""] = alternatives.without
+            tried |= {(effect.name, name): model for name, model in models.items()}
             compared = num - len(waiting)
             progress(compared / num, f"{compared} of {num} effects compared")
             if current is not asked:
