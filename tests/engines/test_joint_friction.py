@@ -1,7 +1,9 @@
 """Friction of each joint is recovered from torques that MuJoCo's own inverse dynamics gives."""
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from npdr_ppl.engines.mujoco.joint_friction import identify_friction
@@ -39,6 +41,22 @@ def test_friction_is_found_in_the_whole_recording_and_in_its_halves(robot, recor
 def test_no_friction_is_found_without_torques(robot, recording):
     silent = replace(recording, actions=tuple(0.0 * values for values in recording.actions))
     for friction in identify_friction(robot, silent).values():
+        assert (friction.dry, friction.viscous) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("is_moving", [True, False])
+def test_friction_that_the_motion_does_not_determine_is_not_a_number(robot, recording, is_moving):
+    """Of a joint that moves in one direction only, dry friction is a constant torque."""
+    (motion,), (torques,) = recording.readings, recording.actions
+    time = recording.time_step * np.arange(len(motion))
+    motion = np.array(motion)
+    motion[:, 0] = time + 0.3 * np.sin(2.0 * time) if is_moving else 0.3
+    changed = replace(recording, readings=(motion,), actions=(0.0 * torques,))
+    base, *others = identify_friction(robot, changed).values()
+    assert all(map(math.isnan, (base.dry, *base.half_dry)))
+    assert math.isnan(base.viscous) != is_moving
+    assert base.share == 0.0
+    for friction in others:
         assert (friction.dry, friction.viscous) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 

@@ -20,17 +20,32 @@ from numpy.typing import NDArray
 
 from npdr_ppl.engines.mujoco.base_parameters import INERTIAL, JOINT, MujocoInverseDynamics
 from npdr_ppl.engines.mujoco.fields import element_names
-from npdr_ppl.engines.mujoco.payload import least_squares, load_robot, torque_rows
+from npdr_ppl.engines.mujoco.payload import (
+    SINGULAR,
+    least_squares,
+    load_robot,
+    normalised,
+    torque_rows,
+)
 from npdr_ppl.rollouts.container import Rollouts
 
 __all__ = ["JointFriction", "identify_friction"]
 
 Array = NDArray[np.float64]
 
+LARGEST_PART = 1e-3
+"""Largest part of a parameter, whose columns have unit length, in combinations of parameters that
+the motion does not determine. Rounding is 1e-9. A joint that turns in one direction only has 0.7,
+as dry friction is then a constant torque."""
+
 
 @dataclass(frozen=True)
 class JointFriction:
     """Friction of a joint.
+
+    Friction that the motion does not determine is NaN: the dry friction of a joint that moves in
+    one direction only looks like a constant torque. A joint that hardly moves has friction, but
+    its values in the two halves differ widely.
 
     Attributes:
         dry: Dry friction f in N m or N, proportional to the recorded torques.
@@ -51,7 +66,9 @@ class JointFriction:
     @property
     def share(self) -> float:
         """Share of the squared torque error that dry friction explains, beside all the rest."""
-        return 1.0 - (self.error / max(self.error_without, 1e-300)) ** 2
+        if self.error_without == 0.0:
+            return 0.0
+        return 1.0 - (self.error / self.error_without) ** 2
 
 
 def identify_friction(robot: str | PathLike[str], rollouts: Rollouts) -> dict[str, JointFriction]:
@@ -78,7 +95,8 @@ def identify_friction(robot: str | PathLike[str], rollouts: Rollouts) -> dict[st
         weights = 1.0 / np.maximum(_errors(rows, weights), 1e-12)
     errors = _errors(rows, weights)
     middle = len(rows) // 2
-    whole, *halves = (_solved(part, weights) for part in (rows, rows[:middle], rows[middle:]))
+    parts = rows, rows[:middle], rows[middle:]
+    whole, *halves = (_determined(part, weights) for part in parts)
     result = {}
     for number, name in enumerate(element_names(model, "joint")):
         first = len(INERTIAL) * len(dynamics.bodies) + len(JOINT) * number
@@ -98,6 +116,15 @@ def identify_friction(robot: str | PathLike[str], rollouts: Rollouts) -> dict[st
 def _solved(rows: Array, weights: Array) -> Array:
     """Returns π and the constant torques, ``(P + nv,)``."""
     return least_squares(rows[..., :-1], rows[..., -1], weights)
+
+
+def _determined(rows: Array, weights: Array) -> Array:
+    """Returns the same, with NaN for parameters that the motion does not determine."""
+    columns, _ = normalised(rows[..., :-1], weights)
+    _, sizes, directions = np.linalg.svd(columns, full_matrices=False)
+    unknown = directions[sizes <= SINGULAR * sizes.max()]
+    is_known = np.linalg.norm(unknown, axis=0) <= LARGEST_PART
+    return np.where(is_known, _solved(rows, weights), np.nan)
 
 
 def _errors(rows: Array, weights: Array) -> Array:

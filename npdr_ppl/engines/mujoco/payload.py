@@ -40,7 +40,14 @@ from npdr_ppl.rollouts.differentiation import (
     thin,
 )
 
-__all__ = ["Payload", "identify_payload", "least_squares", "load_robot", "torque_rows"]
+__all__ = [
+    "Payload",
+    "identify_payload",
+    "least_squares",
+    "load_robot",
+    "normalised",
+    "torque_rows",
+]
 
 Array = NDArray[np.float64]
 
@@ -210,11 +217,22 @@ def least_squares(matrix: Array, torques: Array, weights: Array) -> Array:
         torques: τ, ``(N, nv)``.
         weights: Weight of each joint, ``(nv,)``.
     """
+    columns, lengths = normalised(matrix, weights)
+    target = (torques * weights).reshape(-1)
+    return np.linalg.lstsq(columns, target, rcond=SINGULAR)[0] / lengths
+
+
+def normalised(matrix: Array, weights: Array) -> tuple[Array, Array]:
+    """Returns the weighted columns of Y with unit length, ``(N nv, P)``, and their lengths.
+
+    Args:
+        matrix: Y, ``(N, nv, P)``.
+        weights: Weight of each joint, ``(nv,)``.
+    """
     scaled = (matrix * weights[:, None]).reshape(-1, matrix.shape[-1])
     lengths = np.linalg.norm(scaled, axis=0)
     lengths = np.where(lengths > 0.0, lengths, 1.0)
-    target = (torques * weights).reshape(-1)
-    return np.linalg.lstsq(scaled / lengths, target, rcond=SINGULAR)[0] / lengths
+    return scaled / lengths, lengths
 
 
 def _check_mass(full: Array, columns: slice, body: str) -> None:
