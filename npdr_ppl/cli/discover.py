@@ -84,8 +84,8 @@ def discover(
     repeat: Annotated[
         bool,
         typer.Option(
-            help="Name only effects that both halves of the recording show, and all rollouts but "
-            "each one.",
+            help="Name only effects that each half of the recording shows and, with three "
+            "rollouts or more, that are found whichever rollout is left out.",
         ),
     ] = True,
     learn: Annotated[

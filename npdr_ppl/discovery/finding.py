@@ -28,8 +28,8 @@ class Finding:
         is_minor: Whether it explains too little to be named: no strength differs from zero by two
             standard deviations, or its share is small and something remains that no law explains.
         repetition: Its strengths in parts of the recording; ``None`` for short recordings.
-        found_in: Whether each half of the recording, and each set of all rollouts but one, shows
-            it; empty if it was not sought there.
+        found_in: Whether each half of the recording shows it, and the recording without each of
+            its rollouts; empty if it was not sought there.
         is_compared: Whether it was compared with alternatives. If a time limit prevented it, the
             probability says nothing.
     """

@@ -84,9 +84,9 @@ def judge(
 def _not_found(effect: Finding) -> str:
     """Returns the reason not to name an effect that a part of the recording does not show."""
     where = missing_where({part.part: part.is_found for part in effect.found_in})
-    reason = f"{effect.effect.name} was not found in {where} of the recording"
-    instead = next((part.instead for part in effect.found_in if part.instead), "")
-    return f"{reason}, which {instead} explains better." if instead else f"{reason}."
+    reason = f"{effect.effect.name} was not found in {where}."
+    better = next((part for part in effect.found_in if part.instead), None)
+    return f"{reason} {better.instead} explains {better.part} better." if better else reason
 
 
 def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Finding:

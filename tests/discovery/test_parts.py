@@ -6,8 +6,10 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.search import parts
 from npdr_ppl.discovery.search.parts import found_in_parts, missing_where
 from npdr_ppl.discovery.search.repeatability import HALVES
+from npdr_ppl.discovery.search.settings import REPEATABILITY
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.verdict import judge, most_doubtful
 from npdr_ppl.models.effects import Bias, CoulombFriction, ViscousFriction
@@ -39,7 +41,7 @@ def test_an_effect_of_all_rollouts_is_found_in_both_halves():
     assert record["in_halves"] == dict.fromkeys(HALVES, True)
     assert [part["part"] for part in record["found_in"]] == [
         *HALVES,
-        *(f"all but rollout {number}" for number in range(4)),
+        *(f"the recording without rollout {number}" for number in range(4)),
     ]
 
 
@@ -74,6 +76,13 @@ def test_the_reason_says_in_which_half_an_effect_was_not_found(rubbed_late):
     verdict, reason = judge(search, [friction], 0.0, {}, settings)
     assert verdict == "unknown"
     assert reason == "hinge.coulomb_friction was not found in the first half of the recording."
+    first, second, *others = friction.found_in
+    second = dataclasses.replace(second, is_found=False, instead="hinge.bias")
+    rest = dataclasses.replace(second, part="the recording without rollout 0")
+    other = dataclasses.replace(friction, found_in=(first, rest, *others))
+    assert judge(search, [other], 0.0, {}, settings)[1].endswith(
+        "of the recording. hinge.bias explains the recording without rollout 0 better."
+    )
     # One that explains little does not change the verdict, and is not named.
     small = dataclasses.replace(friction, share=0.01)
     other = dataclasses.replace(friction, effect=Bias("hinge"), share=1.0, found_in=())
@@ -82,12 +91,30 @@ def test_the_reason_says_in_which_half_an_effect_was_not_found(rubbed_late):
     assert most_doubtful(doubtful, settings).effect.name == "hinge.bias"
 
 
-def test_fits_confirm_that_a_part_does_not_show_an_effect(rubbed_late):
-    """One step says so, and a fit of the part says the same."""
-    search = rubbed_late.search
+def test_fits_confirm_that_a_part_does_not_show_an_effect(rubbed_late, monkeypatch):
+    """They are made only where one step does not suffice, and only they count there."""
+    search, fitted = rubbed_late.search, []
+    refitted = parts._refitted
+
+    def counted(part):
+        fitted.append(part.segments.inputs.num_segments)
+        return refitted(part)
+
+    monkeypatch.setattr(parts, "_refitted", counted)
     first, second = found_in_parts(search)["hinge.coulomb_friction"][:2]
     assert (first.part, second.part) == HALVES
-    assert first.probability < 0.5 < second.probability
+    assert first.probability < 0.5 < REPEATABILITY.certain_probability < second.probability
+    halves = len(search.final.fit.offsets) // 2
+    # In the first half, the model with the effect, without it, and possibly with another law.
+    assert 2 <= fitted.count(halves) <= 3
+
+    def never_moves(step, index):
+        return step._whole.along(index)
+
+    # The fit of the whole recording has friction, which the first half contradicts.
+    monkeypatch.setattr(parts._Step, "along", never_moves)
+    again = found_in_parts(search)["hinge.coulomb_friction"][0]
+    assert again.probability == pytest.approx(first.probability, abs=0.05)
 
 
 def test_another_law_that_explains_a_part_better_is_reported(rubbed_late):
@@ -112,8 +139,9 @@ def test_without_repetition_no_parts_are_compared():
 
 
 def test_where_an_effect_is_missing_is_said_in_a_few_words():
-    parts = dict.fromkeys((*HALVES, "all but rollout 0"), True)
+    rest = "the recording without rollout 0"
+    is_in = dict.fromkeys((*HALVES, rest), True)
     first, second = HALVES
-    assert missing_where(parts | {second: False}) == second
-    assert missing_where(parts | {"all but rollout 0": False}) == "all but rollout 0"
-    assert missing_where(dict.fromkeys(parts, False)) == "either half"
+    assert missing_where(is_in | {second: False}) == f"{second} of the recording"
+    assert missing_where(is_in | {rest: False}) == rest
+    assert missing_where(dict.fromkeys(is_in, False)) == "either half of the recording"

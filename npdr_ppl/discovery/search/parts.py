@@ -65,7 +65,7 @@ def found_in_parts(
 ) -> dict[str, list[PartResult]]:
     """Returns which parts of the recording show each effect, by the effect's name.
 
-    Parts are both halves, and of three rollouts or more all but each one.
+    Parts are both halves and, with three rollouts or more, the recording without each of them.
 
     Args:
         search: The search of the whole recording.
@@ -96,22 +96,23 @@ def found_in_parts(
 
 
 def missing_where(in_parts: Mapping[str, bool]) -> str:
-    """Returns where an effect was not found: the part's name, or ``"either half"``.
+    """Returns where an effect was not found: a part's name, or that of both halves together.
 
     Args:
         in_parts: Whether it was found in each part, by the part's name.
     """
     missed = [name for name, is_in in in_parts.items() if not is_in]
-    return "either half" if set(HALVES) <= set(missed) else missed[0]
+    where = "either half" if set(HALVES) <= set(missed) else missed[0]
+    return f"{where} of the recording" if where in (*HALVES, "either half") else where
 
 
 def _parts(hypothesis: Hypothesis) -> Iterator[tuple[str, Tensor]]:
-    """Yields the parts' names and segments: the halves, and all but one of several rollouts."""
+    """Yields the parts' names and segments: both halves, and the rest without each rollout."""
     rollout = hypothesis.segments.inputs.rollout
     yield from halves(len(rollout))
     names = rollout.unique().tolist()
     for name in names if len(names) > 2 else ():
-        yield f"all but rollout {name}", (rollout != name).nonzero()[:, 0]
+        yield f"the recording without rollout {name}", (rollout != name).nonzero()[:, 0]
 
 
 class _Compared:
