@@ -40,6 +40,13 @@ def test_only_a_nearly_linear_motion_has_a_single_minimum():
     assert not has_single_minimum(segments(free), seed=0)
 
 
+def test_a_model_whose_laws_have_local_minima_is_searched(monkeypatch):
+    """Whatever the influence of the other parameters."""
+    declared = property(lambda self: torch.tensor([False, True]))
+    monkeypatch.setattr(SegmentModel, "coordinates_with_minima", declared)
+    assert not has_single_minimum(segments(damped), seed=0)
+
+
 def test_a_fit_with_a_single_minimum_ends_where_one_with_a_search_does(monkeypatch):
     searched = []
     search = base_fit.search_prior

@@ -6,8 +6,9 @@ masses, dampings and frictions, and a fit from any point ends at the same parame
 
 With residuals r and derivatives J in the prior's middle, residuals at a distance Δ are
 r − J Δ + e. Draws of the prior show how large the error e of this linear prediction is. Where it
-is below ¼ J Δ, residuals at two opposite points differ by at least half of what is predicted, and
-nothing between them turns back.
+is below ¼ |J Δ| for all draws, residuals at two opposite points differ by at least three quarters
+of what is predicted. A parameter with little influence beside the others can still have several
+minima. So a model whose laws declare them, such as backlash, is always searched.
 """
 
 import torch
@@ -23,10 +24,14 @@ __all__ = ["has_single_minimum"]
 def has_single_minimum(segments: SegmentModel, *, seed: int) -> bool:
     """Returns whether all draws of the prior change simulations nearly in proportion.
 
+    ``False`` if the misfit has local minima along a parameter of an effect of the model.
+
     Args:
         segments: The model along the recording.
         seed: Seed of the draws.
     """
+    if bool(segments.coordinates_with_minima.any()):
+        return False
     middle = torch.zeros(segments.prior.num_parameters, dtype=torch.float64)
     offsets = segments.no_offsets
     scale = segments.scale_of(middle, offsets)
