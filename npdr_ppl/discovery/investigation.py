@@ -331,6 +331,7 @@ class Investigation:
                 shown,
                 self._data_options,
                 is_held_out=self.holdout is not None,
+                anew=self._anew_of(final),
             )
 
     def _advice(self, name: str) -> NextExperiment | None:

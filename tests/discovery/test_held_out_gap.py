@@ -10,8 +10,10 @@ import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.proof.estimated_anew import estimated_anew
 from npdr_ppl.discovery.proof.held_out_gap import Gap, _Simulated, prove
+from npdr_ppl.discovery.proof.overlays import overlay
 from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
 from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.drawing.overlay_html import MODELS
 from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.models.effects import CoulombFriction, EncoderBias
 from npdr_ppl.models.pendulum import pendulum
@@ -225,3 +227,15 @@ def test_noise_is_that_of_the_other_half(switched_on_twice):
     anew = replace(anew, scales=torch.tensor([[1.0, 2.0], [3.0, 4.0]]))
     noise = anew.noise_of(torch.tensor([False, True]))
     assert noise.tolist() == [[[3.0, 4.0]], [[1.0, 2.0]]]
+
+
+def test_curves_of_held_out_rollouts_have_the_encoders_new_zero(switched_on_twice):
+    before, after, held_out, options = switched_on_twice
+    anew = estimated_anew(after, held_out, options)
+    old, new = (
+        overlay(before, after, before, held_out, options, is_held_out=True, anew=each)
+        for each in (None, anew)
+    )
+    for shown in new.rollouts:
+        (same,) = (one for one in old.rollouts if one.rollout == shown.rollout)
+        assert shown.misfit[MODELS[-1]]["angle"] < 0.5 * same.misfit[MODELS[-1]]["angle"]

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.errors import DataError
+from npdr_ppl.errors import NpdrError
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
@@ -135,7 +135,7 @@ def estimated_anew(
             fit_segments(segments.along(index), z, held=held)
             for index in torch.arange(num).tensor_split(2)
         ]
-    except DataError:
+    except NpdrError:
         return None
     fitted = [fit.z for fit in found]
     every = [segments.prior.to_parameters(each[None]) for each in (z, *fitted)]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.proof.estimated_anew import EstimatedAnew
 from npdr_ppl.discovery.proof.residual_map import noise_of, residuals_by_rollout, thinned
 from npdr_ppl.drawing.overlay_html import MODELS
 from npdr_ppl.errors import NpdrError
@@ -162,6 +163,7 @@ def overlay(
     options: DataOptions,
     *,
     is_held_out: bool,
+    anew: EstimatedAnew | None = None,
 ) -> Overlays:
     """Simulates a recording with the nominal, the fitted and the revised model.
 
@@ -175,6 +177,8 @@ def overlay(
         rollouts: The rollouts to simulate.
         options: How recordings are prepared.
         is_held_out: Whether these rollouts were not used to fit the models.
+        anew: Parameters of the revised model that were estimated anew on these rollouts. As in the
+            gap, each half is simulated with the values of the other half.
     """
     steps = max(2, round(RESTART_SECONDS / rollouts.time_step))
     options = replace(options, segment_length=min(steps, max(rollouts.lengths)))
@@ -183,7 +187,7 @@ def overlay(
     # Several parameters of a model take hardly longer than one.
     made = [
         *_simulated(before, torch.stack((nominal, before.fit.z)), rollouts, options),
-        *_simulated(after, after.fit.z[None], rollouts, options),
+        *_simulated(after, after.fit.z[None], rollouts, options, anew),
     ]
     series = dict(zip(MODELS, made, strict=True))
     measured = [s.double().numpy() for s in rollouts.series(segments.channel_names)]
@@ -206,7 +210,11 @@ def overlay(
 
 
 def _simulated(
-    hypothesis: Hypothesis, z: Tensor, rollouts: Rollouts, options: DataOptions
+    hypothesis: Hypothesis,
+    z: Tensor,
+    rollouts: Rollouts,
+    options: DataOptions,
+    anew: EstimatedAnew | None = None,
 ) -> list[list[Array] | None]:
     """Returns the simulated series ``(T, C)`` of each rollout for each parameters, ``(n, d)``.
 
@@ -214,11 +222,18 @@ def _simulated(
     """
     try:
         segments = SegmentModel(hypothesis.model, rollouts, options, is_complete=True)
-        made = segments.simulate(z, segments.no_offsets.expand(len(z), -1, -1)).double()
+        offsets = segments.no_offsets.expand(len(z), -1, -1)
+        if anew is None:
+            made = segments.simulate(z, offsets).double()
+        else:
+            num = segments.inputs.num_segments
+            made = anew.simulate(
+                segments, z, offsets, torch.arange(num) >= (num + 1) // 2
+            ).double()
     except NpdrError:
         if len(z) == 1:
             return [None]
-        return [_simulated(hypothesis, one[None], rollouts, options)[0] for one in z]
+        return [_simulated(hypothesis, one[None], rollouts, options, anew)[0] for one in z]
     return [
         [s.numpy() for s in stitch(one, segments.inputs, segments.channel_names)] for one in made
     ]
