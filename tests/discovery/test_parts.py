@@ -109,12 +109,30 @@ def test_fits_confirm_that_a_part_does_not_show_an_effect(rubbed_late, monkeypat
     assert 2 <= fitted.count(halves) <= 3
 
     def never_moves(step, index):
-        return step._whole.along(index)
+        return step._whole.along(index), 0.0
 
     # The fit of the whole recording has friction, which the first half contradicts.
     monkeypatch.setattr(parts._Step, "along", never_moves)
     again = found_in_parts(search)["hinge.coulomb_friction"][0]
     assert again.probability == pytest.approx(first.probability, abs=0.05)
+
+
+def test_a_step_that_fails_without_an_effect_is_no_evidence_for_it(monkeypatch):
+    """No friction acts in the first half; only a fit to it shows that none is needed there."""
+    rollouts = joined(swinging(rollouts=2), swinging(rollouts=2, friction=1.0, seed=2))
+    search = npdr.DiscoveryOptions(effects=EFFECTS, repeat=False)
+    found = npdr.discover(pendulum, rollouts, search=search)
+    settings = dataclasses.replace(REPEATABILITY, certain_probability=0.9)
+    monkeypatch.setattr(parts, "REPEATABILITY", settings)
+    first, second = found_in_parts(found.search)["hinge.coulomb_friction"][:2]
+    assert not first.is_found and second.is_found
+    compared = parts._Compared(found.search, found.search.added[0])
+    half = torch.arange(len(found.search.final.fit.offsets) // 2)
+    models = compared._closest(half)
+    # One step alone would say the opposite.
+    alone = compared._judged("", {name: model for name, (model, _) in models.items()})
+    assert alone.is_found and alone.probability >= settings.certain_probability
+    assert models[""][1] > 10.0
 
 
 def test_another_law_that_explains_a_part_better_is_reported(rubbed_late):

@@ -213,7 +213,10 @@ def _linear_share(base: Hypothesis, current: Hypothesis, effect: Effect) -> floa
 
 
 def probabilities(
-    trials: Mapping[str, Hypothesis], without: Hypothesis, is_approximate: bool
+    trials: Mapping[str, Hypothesis],
+    without: Hypothesis,
+    is_approximate: bool,
+    granted: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Returns the probability of each candidate, by name.
 
@@ -221,9 +224,14 @@ def probabilities(
         trials: The model with each candidate, by the candidate's name.
         without: The model without the candidates.
         is_approximate: Whether something remains that no law of the catalogue explains.
+        granted: Log density that is added to that of candidates, by name.
     """
     strains = _strains(trials, without, is_approximate)
-    prior = [log_prior(t) - strain for t, strain in zip(trials.values(), strains, strict=True)]
+    extra = [0.0 if granted is None else granted.get(name, 0.0) for name in trials]
+    prior = [
+        log_prior(trial) - strain + gain
+        for trial, strain, gain in zip(trials.values(), strains, extra, strict=True)
+    ]
     return dict(zip(trials, weigh(list(trials.values()), prior), strict=True))
 
 

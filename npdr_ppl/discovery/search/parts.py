@@ -12,7 +12,9 @@ the closest fit z + δ to a part P follows, to first order, without another sear
 
 with the share ρ of independent measurements. Each model is simulated once at its z + δ, and the
 models' evidence is compared along the part. One step can be wrong where the motion is sensitive or
-sticks. So fits of the part must confirm a result that is not certain, and every "not found".
+sticks: it then gains less than the ½ δᵀ (ρ Σ_P Jᵀ C⁻¹ r − z) that it should. If the result could
+be another one with what the other models' steps failed to gain, fits of the part decide; also if
+the result is not certain, and before every "not found".
 """
 
 import math
@@ -141,17 +143,19 @@ class _Compared:
         if self._without is None:
             return PartResult(part, True, 1.0)
         own = self._effect.name
-        models = {name: h for name, h in self._closest(index).items() if h is not None}
+        steps = self._closest(index)
+        models = {name: model for name, (model, _) in steps.items()}
         if own not in models or "" not in models:
             return None
-        found = self._judged(part, models)
-        if found.is_found and found.probability >= REPEATABILITY.certain_probability:
-            return found
-        asked = (own, "", found.instead) if found.instead else (own, "")
+        missed = {name: gain for name, (_, gain) in steps.items() if name != own}
+        least = self._judged(part, models, missed)
+        if least.is_found and least.probability >= REPEATABILITY.certain_probability:
+            return self._judged(part, models)
+        asked = (own, "", least.instead) if least.instead else (own, "")
         return self._judged(part, {name: _refitted(models[name]) for name in asked})
 
-    def _closest(self, index: Tensor) -> dict[str, Hypothesis | None]:
-        """Returns the models with the least loss along a part, fitted to it by one step."""
+    def _closest(self, index: Tensor) -> dict[str, tuple[Hypothesis, float]]:
+        """Returns the models with the least loss along a part, see :meth:`_Step.along`."""
         assert self._without is not None
         every = {"": self._without} | self._trials
         scale = self._trials[self._effect.name].fit.scale
@@ -162,17 +166,27 @@ class _Compared:
             if name not in self._steps:
                 self._steps[name] = _Step(every[name]) if every[name].can_be_linearised else None
         return {
-            name: None if (step := self._steps[name]) is None else step.along(index)
-            for name in chosen
+            name: step.along(index) for name in chosen if (step := self._steps[name]) is not None
         }
 
-    def _judged(self, part: str, models: Mapping[str, Hypothesis]) -> PartResult:
-        """Returns what models that are fitted to a part say."""
-        own = self._effect.name
+    def _judged(
+        self,
+        part: str,
+        models: Mapping[str, Hypothesis],
+        granted: Mapping[str, float] | None = None,
+    ) -> PartResult:
+        """Returns what models that are fitted to a part say.
+
+        Args:
+            part: Name of the part.
+            models: The models by the law's name, ``""`` for the one without the effect.
+            granted: Log density that is added to that of models, by name.
+        """
+        own, granted = self._effect.name, granted or {}
         without = models[""]
         laws = {name: h for name, h in models.items() if name}
-        against_none = weigh([without, models[own]], [0.0, 0.0])[1]
-        weights = probabilities(laws, without, self._is_approximate)
+        against_none = weigh([without, models[own]], [granted.get("", 0.0), 0.0])[1]
+        weights = probabilities(laws, without, self._is_approximate, granted)
         likeliest = max(weights, key=lambda name: weights[name])
         is_likely = weights[own] >= EVIDENCE.least_probability or self._is_same(likeliest, models)
         is_found = against_none >= REPEATABILITY.least_probability and is_likely
@@ -203,11 +217,14 @@ class _Step:
         self._whole, self._projection = hypothesis, Projection(hypothesis)
         self._information = self._projection.parameter_information_by_segment
 
-    def along(self, index: Tensor) -> Hypothesis:
+    def along(self, index: Tensor) -> tuple[Hypothesis, float]:
         """Returns the model along a part, at the better end of the step.
 
         Args:
             index: The part's segments.
+
+        Returns:
+            The model, and by how much less its log density has grown than the step should gain.
         """
         whole, share = self._whole, self._whole.share
         z = whole.fit.z.double()
@@ -218,7 +235,9 @@ class _Step:
         here.keep_difference(whole.difference[index])
         offsets = self._projection.offsets_after(step)[index]
         there = replace(here, fit=replace(here.fit, z=z + step, offsets=offsets))
-        return min(here, there, key=self._loss)
+        losses = self._loss(here), self._loss(there)
+        gain = max(0.0, losses[0] - losses[1])
+        return there if gain > 0.0 else here, max(0.0, 0.5 * float(step @ score) - gain)
 
     def _loss(self, part: Hypothesis) -> float:
         """Returns minus the log density along a part, the prior included."""

@@ -236,8 +236,8 @@ class RepeatabilitySettings:
         least_probability: Probability of an effect, against the model without it, from which a
             part shows it. The whole recording has found it before, so the part need not overcome
             the number of candidates.
-        certain_probability: Probability of an effect in a part, after one Gauss-Newton step, from
-            which fits of the part need not confirm it.
+        certain_probability: Least probability of an effect in a part, after one Gauss-Newton step,
+            from which fits of the part need not confirm it.
     """
 
     fewest_segments: int = 8
