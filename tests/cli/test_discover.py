@@ -303,7 +303,7 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     show.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "Too small to be named, but in the model: hinge.wind." in shown
-    assert "hinge.wind was not found in the first half." in shown
+    assert "hinge.wind was not found in the first half of the recording." in shown
     assert "hinge.bias was not found" not in shown
     assert "Not compared with alternatives" not in shown
     found["effects"][0]["probability"] = None  # a time limit ended the search

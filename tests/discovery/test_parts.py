@@ -130,9 +130,13 @@ def test_a_step_that_fails_without_an_effect_is_no_evidence_for_it(monkeypatch):
     half = torch.arange(len(found.search.final.fit.offsets) // 2)
     models = compared._closest(half)
     # One step alone would say the opposite.
-    alone = compared._judged("", {name: model for name, (model, _) in models.items()})
+    plain = {name: model for name, (model, _) in models.items()}
+    alone = compared._judged("", plain)
     assert alone.is_found and alone.probability >= settings.certain_probability
     assert models[""][1] > 10.0
+    # The same holds for a step that fails with another law.
+    other = min(set(plain) - {"", "hinge.coulomb_friction"})
+    assert compared._judged("", plain, {other: 1e3}).instead == other
 
 
 def test_another_law_that_explains_a_part_better_is_reported(rubbed_late):
