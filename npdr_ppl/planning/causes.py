@@ -169,11 +169,16 @@ def prior_of(model: Model, time_step: float) -> Prior:
 def at_time_step(known: Known, time_step: float) -> Known:
     """Returns the same knowledge for recordings with another time step.
 
+    Draws of the prior become draws of the prior at that time step.
+
     Raises:
         DataError: The priors at that time step do not contain a cause's parameters.
     """
     if math.isclose(time_step, known.time_step):
         return known
+    if known.is_prior:
+        # In reference coordinates every prior is the same normal distribution.
+        return replace(known, time_step=time_step)
     causes = tuple(_cause_at(cause, known.time_step, time_step) for cause in known.causes)
     # A segment keeps its length in seconds.
     length = known.segment_length

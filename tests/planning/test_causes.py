@@ -7,9 +7,11 @@ import pytest
 
 from npdr_ppl.discovery.proof.surviving_causes import VERSION
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.models.effect_additions import add_file
+from npdr_ppl.models.effects import effect_class
 from npdr_ppl.models.pendulum import pendulum
-from npdr_ppl.planning.causes import at_time_step, causes_of_run, prior_of
+from npdr_ppl.planning.causes import at_time_step, causes_of_prior, causes_of_run, prior_of
 from tests.helpers.effect_files import CUBIC
 
 
@@ -97,6 +99,17 @@ def test_a_delay_longer_than_the_prior_at_another_time_step_gets_a_sentence(dela
     (delayed / "discovery.json").write_text(json.dumps(found))
     with pytest.raises(DataError, match="closer to that of the recording, 0.02 s"):
         at_time_step(causes_of_run(delayed, pendulum), 0.008)
+
+
+def test_draws_of_a_prior_are_drawn_again_at_another_time_step():
+    # At 0.02 s the prior of the delay reaches farther than at 0.005 s.
+    model = add_effect(pendulum, effect_class("input_delay")("torque"))
+    known = causes_of_prior(model, seed=0)
+    moved = at_time_step(known, 0.005)
+    for cause in moved.causes:
+        values = prior_of(cause.model, moved.time_step).to_parameters(cause.z[None])
+        assert 0.0 < float(values["torque.input_delay.delay"]) < 0.05
+    assert at_time_step(moved, 0.02).causes == known.causes
 
 
 def test_another_law_of_the_same_port_is_not_taken_for_it(run, tmp_path):
