@@ -411,7 +411,8 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
         table.add_column("parameter", overflow="fold")
         rows = [(width["name"], width) for width in found["widths"]]
         digits = ".2g"
-    for column in ("so far", "with the plan", "with a random recording"):
+    # Short, so that the names of causes are not broken.
+    for column in ("so far", "planned", "random"):
         table.add_column(column, justify="right")
     for *names, values in rows:
         figures = (values["before"], values["after"], values["random"])
@@ -423,15 +424,16 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
         for values in found["starts"]
     ]
     if len(set(starts)) == 1:
-        console.print(f"Start at rest at {starts[0]}.", highlight=False)
+        console.print(f"Start at rest at {escape(starts[0])}.", highlight=False)
     else:
         for index, start in enumerate(starts):
-            console.print(f"Start rollout {index} at rest at {start}.", highlight=False)
+            console.print(f"Start rollout {index} at rest at {escape(start)}.", highlight=False)
     if found["has_stopped"]:
         console.print("The time limit ended the search; a longer --search-time may find more.")
     rollouts = f"{found['rollouts']} rollouts of " if found["rollouts"] > 1 else ""
     console.print(
-        f"The commands for {rollouts}{found['duration']:.4g} s are in {out}", highlight=False
+        f"The commands for {rollouts}{found['duration']:.4g} s are in {escape(str(out))}",
+        highlight=False,
     )
 
 
@@ -474,14 +476,14 @@ def _told_by_plan(found: Mapping[str, Any]) -> str:
         told = f"{told} For {wanted:.0%}, about {needed} rollouts are needed: --rollouts {needed}."
     # A short search finds less than the plan did, so only what exceeds it is an advice.
     better = {
-        limit: f"twice the {_LIMITS[limit]}: {chance:.0%}"
+        limit: f"up to twice the {_LIMITS[limit]}: {chance:.0%}"
         for limit, chance in outlook["with_twice_the"].items()
         if chance > outlook["chance_of_the_right_name"] + _LEAST_GAIN
     }
     if better:
         return f"{told} With {', with '.join(better.values())}."
     if outlook["with_twice_the"]:
-        return f"{told} A short search within limits twice as wide found nothing better."
+        return f"{told} A short search within limits up to twice as wide found nothing better."
     return told
 
 

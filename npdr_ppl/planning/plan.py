@@ -73,9 +73,10 @@ class Outlook:
     Attributes:
         planned: The chance that it names the right cause, and a wrong one, after the plan.
         random: The same after as many random rollouts.
-        needed: Number of such rollouts after which the chance is at least 0.9; ``None`` if more
-            than 60 would be needed.
-        wider: The chance with each limit twice as wide, if that of the plan is less than 0.9.
+        needed: Smallest number of such rollouts after which the chance is at least 0.9; ``None``
+            if more than 60 would be needed.
+        wider: The chance with each limit up to twice as wide, if that of the plan is less than
+            0.9.
     """
 
     planned: Chance
@@ -189,12 +190,14 @@ def plan_recording(
         seed=seed,
         progress=progress,
     )
+    progress(None, "compute what the best excitations show")
     if not is_separating:
         return _informing(known, explored, rollouts or 1)
     plan = _separating(known, explored, rollouts)
     outlook = plan.outlook
     if outlook is None or outlook.planned.right >= PLANNING.wanted:
         return plan
+    progress(None, "try wider limits")
     wider = chances_with_wider_limits(
         known,
         limits,
@@ -237,14 +240,26 @@ def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
     )
     chosen = every[:allowed]
     random = explored.random(len(chosen))
-    is_enough = chance_of(known, shown, every).right >= PLANNING.wanted
     outlook = Outlook(
         chance_of(known, shown, chosen),
         chance_of(known, shown, random),
-        len(every) if is_enough else None,
+        _needed(known, shown, every, rollouts),
     )
     pairs = _pairs(known, shown, chosen, random)
     return _plan(explored, chosen, random, pairs=pairs, outlook=outlook)
+
+
+def _needed(known: Known, shown: Shown, every: Sequence[int], rollouts: int | None) -> int | None:
+    """Returns how many of the chosen candidates suffice; ``None`` if all of them do not."""
+
+    def suffice(number: int) -> bool:
+        return chance_of(known, shown, every[:number]).right >= PLANNING.wanted
+
+    if not suffice(len(every)):
+        return None
+    # Without a number of rollouts, none was added after they sufficed.
+    fewer = range(1, min(rollouts or 1, len(every)))
+    return next((number for number in fewer if suffice(number)), len(every))
 
 
 def _informing(known: Known, explored: Explored, rollouts: int) -> Plan:

@@ -5,6 +5,8 @@ import time
 from dataclasses import dataclass, replace
 
 from npdr_ppl.errors import DataError
+from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.planning.causes import Known
 from npdr_ppl.planning.exploration import explore
 from npdr_ppl.planning.limits import ActionLimits, ChannelLimits, Limits
@@ -41,7 +43,7 @@ def chances_with_wider_limits(
         time_limit: Seconds after which no further kind is searched.
     """
     begin, result = time.monotonic(), []
-    wider = wider_limits(limits)
+    wider = wider_limits(limits, known.causes[0].simulator)
     for name, allowed in wider.items():
         left = time_limit - (time.monotonic() - begin)
         if left <= 0.0:
@@ -62,37 +64,52 @@ def chances_with_wider_limits(
     return tuple(sorted(result, key=lambda one: one.chance, reverse=True))
 
 
-def wider_limits(limits: Limits) -> dict[str, Limits]:
-    """Returns the limits with each kind twice as wide, without those that have no end."""
+def wider_limits(limits: Limits, simulator: Simulator) -> dict[str, Limits]:
+    """Returns the limits with each kind twice as wide, without those that cannot be wider.
+
+    Commands and positions do not go beyond what the model declares: a motor has no more.
+
+    Args:
+        limits: The limits.
+        simulator: The simulator, with the ranges of its actions and sensors.
+    """
     nyquist = 0.5 / limits.time_step
+    declared = {c.name: c for c in (*simulator.actions, *simulator.sensors)}
     result = {
         "commands": replace(
-            limits, actions={name: _more_command(a) for name, a in limits.actions.items()}
+            limits,
+            actions={n: _more_command(a, declared[n]) for n, a in limits.actions.items()},
         ),
         "channels": replace(
-            limits, channels={name: _more_motion(c) for name, c in limits.channels.items()}
+            limits,
+            channels={n: _more_motion(c, declared[n]) for n, c in limits.channels.items()},
         ),
         "bandwidth": replace(limits, bandwidth=min(2.0 * limits.bandwidth, nyquist)),
     }
     return {name: allowed for name, allowed in result.items() if allowed != limits}
 
 
-def _more_command(action: ActionLimits) -> ActionLimits:
+def _more_command(action: ActionLimits, declared: Channel) -> ActionLimits:
     """Returns a command's limits twice as far from its value at rest, and twice the rates."""
+    low = max(2.0 * action.min - action.start, declared.lower)
+    high = min(2.0 * action.max - action.start, declared.upper)
     return replace(
         action,
-        min=2.0 * action.min - action.start,
-        max=2.0 * action.max - action.start,
+        # A recording may have gone beyond what the model declares.
+        min=min(low, action.min),
+        max=max(high, action.max),
         max_rate=2.0 * action.max_rate,
         max_acceleration=2.0 * action.max_acceleration,
     )
 
 
-def _more_motion(channel: ChannelLimits) -> ChannelLimits:
+def _more_motion(channel: ChannelLimits, declared: Channel) -> ChannelLimits:
     """Returns a channel's limits about the same middle, twice as wide, and twice the rates."""
     if math.isfinite(channel.max - channel.min):
         half = 0.5 * (channel.max - channel.min)
-        channel = replace(channel, min=channel.min - half, max=channel.max + half)
+        low = max(channel.min - half, declared.lower)
+        high = min(channel.max + half, declared.upper)
+        channel = replace(channel, min=min(low, channel.min), max=max(high, channel.max))
     return replace(
         channel,
         max_rate=2.0 * channel.max_rate,

@@ -44,11 +44,11 @@ def test_a_plan_that_suffices_says_how_probably(capsys, tmp_path):
         ({"needed_rollouts": None}, "even 60 rollouts do not suffice for 90%."),
         (
             {"with_twice_the": {"channels": 0.9, "bandwidth": 0.8, "commands": 0.63}},
-            "With twice the positions and speeds: 90%, with twice the bandwidth: 80%.",
+            "With up to twice the positions and speeds: 90%, with up to twice the bandwidth: 80%.",
         ),
         (
             {"with_twice_the": {"channels": 0.64}},
-            "A short search within limits twice as wide found nothing better.",
+            "A short search within limits up to twice as wide found nothing better.",
         ),
     ],
 )

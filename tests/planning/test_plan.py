@@ -51,6 +51,8 @@ def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
     assert len(found.random) == len(found.recording)
     more = plan_recording(known, limits, rollouts=3, rounds=3, seed=1)
     assert len(more.recording) == 3
+    if outlook.needed is not None and outlook.needed <= 3:
+        assert more.outlook.needed == outlook.needed
     # Three rollouts show more of every pair than the first of them alone.
     one = plan_recording(known, limits, rollouts=1, rounds=3, seed=1)
     for pair, less in zip(more.pairs, one.pairs, strict=True):
@@ -64,25 +66,37 @@ def test_a_plan_that_does_not_suffice_says_what_wider_limits_would_give(survivin
     found = plan_recording(known, narrow, rollouts=1, rounds=2, seed=1)
     assert found.outlook.planned.right < PLANNING.wanted
     wider = {one.limit: one.chance for one in found.outlook.wider}
-    assert set(wider) == set(wider_limits(narrow)) == {"commands", "channels", "bandwidth"}
+    assert set(wider) == set(wider_limits(narrow, known.causes[0].simulator))
+    assert {"channels", "bandwidth"} <= set(wider)
     assert all(0.0 <= chance <= 1.0 for chance in wider.values())
     assert list(wider.values()) == sorted(wider.values(), reverse=True)
     assert found.to_dict()["outlook"]["with_twice_the"] == wider
 
 
 def test_wider_limits_are_twice_as_wide_about_the_same_middle(unrecorded):
-    _, limits = unrecorded
+    known, limits = unrecorded
+    simulator = known.causes[0].simulator
+    greatest = simulator.actions[0].upper
+    assert 4.0 < greatest < 5.5
     action = ActionLimits(-1.0, 3.0, max_rate=10.0, start=0.5)
     channel = ChannelLimits(-1.0, 2.0, max_rate=4.0, noise=1e-3)
     free = replace(limits, bandwidth=0.5 / limits.time_step, actions={"torque": action})
-    wider = wider_limits(replace(free, channels={"angle": channel}))
+    wider = wider_limits(replace(free, channels={"angle": channel}), simulator)
     torque = wider["commands"].actions["torque"]
-    assert (torque.min, torque.max, torque.max_rate, torque.start) == (-2.5, 5.5, 20.0, 0.5)
+    assert (torque.min, torque.max, torque.max_rate, torque.start) == (-2.5, greatest, 20.0, 0.5)
     angle = wider["channels"].channels["angle"]
     assert (angle.min, angle.max, angle.max_rate, angle.noise) == (-2.5, 3.5, 8.0, 1e-3)
     # Half the sampling rate cannot be exceeded, and what has no limits cannot be wider.
     assert "bandwidth" not in wider
-    assert "channels" not in wider_limits(replace(free, channels={"angle": ChannelLimits()}))
+    assert "channels" not in wider_limits(
+        replace(free, channels={"angle": ChannelLimits()}), simulator
+    )
+    # A motor has no more than it has, unless the recording shows that it has.
+    all_of_it = {"torque": ActionLimits(-greatest, greatest)}
+    assert "commands" not in wider_limits(replace(free, actions=all_of_it), simulator)
+    more = {"torque": ActionLimits(-6.0, 6.0, max_rate=10.0)}
+    found = wider_limits(replace(free, actions=more), simulator)["commands"].actions["torque"]
+    assert (found.min, found.max, found.max_rate) == (-6.0, 6.0, 20.0)
 
 
 @pytest.mark.parametrize("number", [0, 61])
