@@ -11,6 +11,7 @@ import torch
 from npdr_ppl.cli.effect_words import named_effects
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effect_additions import add_file
+from npdr_ppl.models.effects import effects
 from npdr_ppl.models.pendulum import Pendulum
 
 PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
@@ -64,3 +65,8 @@ def test_the_example_can_be_attached_and_added(scope, tmp_path, monkeypatch):
     assert attached.name == "hinge.magnet"
     assert add_file(file).ids == ("magnet",)
     assert [effect.name for effect in named_effects(["hinge.magnet"])] == ["hinge.magnet"]
+
+
+def test_the_readme_has_the_number_of_effects():
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    assert re.findall(r"\[(\d+): `npdr effects`\]", readme) == [str(len(effects()))]

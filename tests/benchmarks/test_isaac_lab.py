@@ -78,3 +78,16 @@ def test_a_wheel_is_read_without_running_it(tmp_path):
 def test_the_stand_in_requires_an_operation_of_every_term_that_takes_one():
     for name, arguments in TERMS.items():
         assert arguments.get("operation", REQUIRED) is REQUIRED, name
+
+
+def test_a_file_without_terms_is_no_success(tmp_path):
+    (tmp_path / "events.py").write_text("ranges = {}\n")
+    (tmp_path / "terms.py").write_text(SOURCE)
+    command = [
+        sys.executable,
+        str(SCRIPT),
+        str(tmp_path / "events.py"),
+        str(tmp_path / "terms.py"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and "has no terms of events" in done.stderr
