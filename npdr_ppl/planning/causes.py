@@ -83,6 +83,14 @@ class Known:
     noise: Mapping[str, float] = field(default_factory=dict)
     is_prior: bool = field(default=False)
 
+    @property
+    def probabilities(self) -> list[float]:
+        """The probabilities of the causes, whose sum is 1; all the same if they are not known."""
+        if all(cause.probability is None for cause in self.causes):
+            return [1.0 / len(self.causes)] * len(self.causes)
+        likely = [cause.probability or PLANNING.least_likely for cause in self.causes]
+        return [part / sum(likely) for part in likely]
+
 
 def causes_of_run(run: Path, model: Callable[..., Any]) -> Known:
     """Reads the causes that a finished run leaves possible.

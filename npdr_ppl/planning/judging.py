@@ -198,13 +198,12 @@ class Judge:
         evidence that few blocks have: E exp(-Σ w_k d_k²/8) with exponential weights w_k. A pair
         that no recording separates does not keep the others from being separated.
         """
-        num, every = len(self.known.causes), self._every
-        likely = [cause.probability or 1.0 / num for cause in self.known.causes]
+        likely, every = self.known.probabilities, self._every
         with np.errstate(invalid="ignore"):  # of candidates that cannot be judged
             terms = [
                 0.5 * math.log(likely[a] * likely[b])
                 - every * np.log1p(self._separation(played, a, b, every=every) / 8.0).sum(0)
-                for a, b in itertools.combinations(range(num), 2)
+                for a, b in itertools.combinations(range(len(likely)), 2)
             ]
             return -np.logaddexp.reduce(terms, axis=0)
 

@@ -80,7 +80,7 @@ def rollouts_that_inform(
 
 def chance_of(known: Known, shown: Shown, chosen: Sequence[int]) -> Chance:
     """Returns the chance that discovery names the right cause after some candidates."""
-    return chance_of_naming(probabilities(known), shown.squares(chosen))
+    return chance_of_naming(known.probabilities, shown.squares(chosen))
 
 
 def certainty(known: Known, shown: Shown, chosen: Sequence[int]) -> float:
@@ -89,19 +89,10 @@ def certainty(known: Known, shown: Shown, chosen: Sequence[int]) -> float:
     It is the bound of :meth:`~npdr_ppl.planning.judging.Judge.certainty`, over both directions of
     every pair.
     """
-    likely = probabilities(known)
+    likely = known.probabilities
     squares = shown.squares(chosen)
     terms = [
         0.5 * math.log(likely[a] * likely[b]) - float(np.log1p(squares[a, b] / 8.0).sum())
         for a, b in itertools.permutations(range(len(likely)), 2)
     ]
     return -float(torch.tensor(terms).logsumexp(0))
-
-
-def probabilities(known: Known) -> list[float]:
-    """Returns the probabilities of the causes; all are the same if they are not known."""
-    likely = [cause.probability or PLANNING.least_likely for cause in known.causes]
-    if all(cause.probability is None for cause in known.causes):
-        likely = [1.0] * len(likely)
-    total = sum(likely)
-    return [part / total for part in likely]

@@ -1,6 +1,7 @@
 """The causes of a run with a learned law, whose file is among the added effects or not."""
 
 import json
+from dataclasses import replace
 from statistics import NormalDist
 
 import pytest
@@ -120,3 +121,22 @@ def test_another_law_of_the_same_port_is_not_taken_for_it(run, tmp_path):
     add_file(other)
     with pytest.raises(DataError, match="learned the law −c v³, but .* has another, −c v⁵"):
         causes_of_run(run, pendulum)
+
+
+@pytest.mark.parametrize(
+    ("stored", "found"),
+    [
+        ((None, None), (0.5, 0.5)),
+        ((0.6, 0.2), (0.75, 0.25)),
+        ((0.9, 0.0), (1.0, 0.0)),
+    ],
+)
+def test_probabilities_have_a_sum_of_one_and_are_above_zero(stored, found):
+    drawn = causes_of_prior(pendulum, seed=0)
+    causes = tuple(
+        replace(cause, probability=value)
+        for cause, value in zip(drawn.causes, stored, strict=False)
+    )
+    known = replace(drawn, causes=causes, is_prior=False)
+    assert known.probabilities == pytest.approx(found, abs=1e-5)
+    assert min(known.probabilities) > 0.0

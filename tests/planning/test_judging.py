@@ -103,7 +103,7 @@ def test_certainty_is_that_of_the_pairs(surviving):
     pair = replace(known, causes=known.causes[:2], separations=known.separations[:2, :2])
     judge = Judge(pair, limits, seed=0)
     played = judge.played(*candidates(limits))
-    before = -0.5 * np.log([cause.probability for cause in pair.causes]).sum()
+    before = -0.5 * np.log(pair.probabilities).sum()
     gained = judge.certainty(played) - before
     # Π_k (1 + d_k²/8) of parts d_k² is at least 1 + d²/8 and at most exp(d²/8).
     square = separations(judge, played)[:, 0, 1]
