@@ -193,17 +193,20 @@ def plan_recording(
     progress(None, "compute what the best excitations show")
     if not is_separating:
         return _informing(known, explored, rollouts or 1)
+    searched = time.monotonic()
     plan = _separating(known, explored, rollouts)
     outlook = plan.outlook
     if outlook is None or outlook.planned.right >= PLANNING.wanted:
         return plan
+    figured = time.monotonic()
     progress(None, "try wider limits")
     wider = chances_with_wider_limits(
         known,
         limits,
         len(plan.recording),
         seed=seed,
-        time_limit=time_limit - (time.monotonic() - begin),
+        time_limit=time_limit - (figured - begin),
+        least_time=figured - searched,
     )
     return replace(plan, outlook=replace(outlook, wider=wider))
 

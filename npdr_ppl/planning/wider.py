@@ -31,7 +31,13 @@ class Wider:
 
 
 def chances_with_wider_limits(
-    known: Known, limits: Limits, number: int, *, seed: int, time_limit: float
+    known: Known,
+    limits: Limits,
+    number: int,
+    *,
+    seed: int,
+    time_limit: float,
+    least_time: float = 0.0,
 ) -> tuple[Wider, ...]:
     """Returns the chance with each kind of limit twice as wide, the greatest first.
 
@@ -41,12 +47,15 @@ def chances_with_wider_limits(
         number: Number of rollouts.
         seed: Seed of the searches.
         time_limit: Seconds after which no further kind is searched.
+        least_time: Seconds that a kind takes at least, as the final figures of the plan did. No
+            kind is searched if less time is left.
     """
     begin, result = time.monotonic(), []
     wider = wider_limits(limits, known.causes[0].simulator)
     for name, allowed in wider.items():
-        left = time_limit - (time.monotonic() - begin)
-        if left <= 0.0:
+        began = time.monotonic()
+        left = time_limit - (began - begin)
+        if left <= least_time:
             break
         try:
             explored = explore(
@@ -61,6 +70,7 @@ def chances_with_wider_limits(
             continue  # no motion with these limits can be simulated
         chosen = rollouts_that_separate(known, shown, explored.every, least=number, most=number)
         result.append(Wider(name, chance_of(known, shown, chosen).right))
+        least_time = time.monotonic() - began
     return tuple(sorted(result, key=lambda one: one.chance, reverse=True))
 
 

@@ -15,7 +15,7 @@ from npdr_ppl.planning.causes import causes_of_run, prior_of
 from npdr_ppl.planning.judging import Judge
 from npdr_ppl.planning.limits import ActionLimits, ChannelLimits, default_limits, read_limits
 from npdr_ppl.planning.settings import PLANNING
-from npdr_ppl.planning.wider import wider_limits
+from npdr_ppl.planning.wider import chances_with_wider_limits, wider_limits
 from tests.helpers.command_line import run_for_module
 
 pytestmark = pytest.mark.slow
@@ -71,6 +71,16 @@ def test_a_plan_that_does_not_suffice_says_what_wider_limits_would_give(survivin
     assert all(0.0 <= chance <= 1.0 for chance in wider.values())
     assert list(wider.values()) == sorted(wider.values(), reverse=True)
     assert found.to_dict()["outlook"]["with_twice_the"] == wider
+
+
+def test_wider_limits_are_not_tried_without_the_time_for_it(surviving):
+    known, limits = surviving
+    # A search takes longer than its limit, because one batch is always judged.
+    assert (
+        chances_with_wider_limits(known, limits, 1, seed=1, time_limit=5.0, least_time=5.0) == ()
+    )
+    (found,) = chances_with_wider_limits(known, limits, 1, seed=1, time_limit=0.1)
+    assert found.limit in wider_limits(limits, known.causes[0].simulator)
 
 
 def test_wider_limits_are_twice_as_wide_about_the_same_middle(unrecorded):
