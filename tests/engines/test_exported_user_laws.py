@@ -240,14 +240,57 @@ class SoftServo(ServoEffect):
         return error * error.abs() / (error.abs() + parameters["width"])
 
 
+class FilteredServo(ServoEffect):
+    """A servo that acts on the error after a low-pass, which begins at the first error."""
+
+    id = "filtered_servo"
+    parameters = (Parameter("time_constant", "s", 0.0),)
+
+    def default_priors(self, port):
+        """Wide."""
+        return {"time_constant": dist.Uniform(0.0, 1.0)}
+
+    def initial_memory(self, error):
+        """The error itself."""
+        return error
+
+    def act(self, error, parameters, memory):
+        """Takes the filtered error."""
+        return memory
+
+    def next_memory(self, error, parameters, memory, time_step):
+        """Approaches the error; at once if the time constant is zero."""
+        return error + (memory - error) * torch.exp(-time_step / parameters["time_constant"])
+
+
+class WithTheLoad(ForceEffect):
+    """Friction that is greater where the joint moves away from zero."""
+
+    id = "with_the_load"
+    parameters = (Parameter("damping", "{port}", 0.0),)
+
+    def default_priors(self, port):
+        """Wide."""
+        return {"damping": dist.Normal(0.0, 1.0)}
+
+    def force(self, position, velocity, parameters, memory):
+        """Compares two comparisons, as Python would not with `a > b == c > d`."""
+        leaves = (velocity > 0.0) == (position > 0.0)
+        return -parameters["damping"] * velocity * torch.where(leaves, 1.0, 0.5)
+
+
 OWN = {
     "a state of a force": (Warming("shoulder_torque"), {"damping": 0.8, "rate": 0.5}),
     "a state of a command": (Creeping("motor"), {"share": 0.6}),
     "a state of a measurement": (Sticky("elbow"), {"share": 0.6}),
     "a servo": (SoftServo("servo"), {"width": 0.1}),
+    "a state of a servo": (FilteredServo("servo"), {"time_constant": 0.05}),
+    "a time constant of zero": (FilteredServo("servo"), {"time_constant": 0.0}),
+    "a comparison of comparisons": (WithTheLoad("shoulder_torque"), {"damping": 0.8}),
 }
 
 
+@pytest.mark.filterwarnings("ignore:divide by zero:RuntimeWarning")
 @pytest.mark.parametrize("kind", OWN)
 def test_an_effect_of_ones_own_is_reproduced_with_its_state(arm, tmp_path, kind):
     effect, values = OWN[kind]
@@ -293,12 +336,21 @@ class Reserved(Creeping):
     parameters = (Parameter("memory", "1", 0.0),)
 
 
+class Coarse(Creeping):
+    """A law that cuts off decimals."""
+
+    def act(self, commands, parameters, memory, time_step):
+        """Makes a whole number."""
+        return parameters["share"] * commands.now().to(torch.int64), memory
+
+
 @pytest.mark.parametrize(
     ("effect_class", "sentence"),
     [
         (Branching, "branches on a number; torch.where instead of `if`"),
         (Delayed, "needs earlier commands"),
         (Tabulated, "it uses sum"),
+        (Coarse, "it makes whole numbers of numbers"),
         (Reserved, 'parameter "memory" has a name that the file needs itself'),
     ],
 )
@@ -310,6 +362,28 @@ def test_what_cannot_be_followed_is_refused_by_name(arm, effect_class, sentence)
     assert sentence in found.refused[effect.name]
     with pytest.raises(ModelError):
         trace(effect)
+
+
+def test_a_law_of_several_joints_is_refused_by_name(arm):
+    class Coupled(Warming):
+        needs_joint = True
+
+        def begin_step(self, joint, parameters, memory, time_step):
+            return (joint.others["elbow_torque"][0],)
+
+    effect = Coupled("shoulder_torque")
+    values = {site: torch.tensor(0.5) for site in effect.parameter_names}
+    found = export_mjcf(arm.with_effects(effect), values)
+    assert found.refused[effect.name] == "it depends on another joint, elbow_torque"
+
+
+@pytest.mark.parametrize("name", ["Effects", "VALUES", "field", "np"])
+def test_a_class_with_a_name_in_the_file_gets_another_one(arm, name):
+    class Own(Warming):
+        pass
+
+    Own.__name__ = name
+    assert python_file._class_names([Own("shoulder_torque")]).popitem()[1] == f"{name}2"
 
 
 def test_a_class_with_a_name_of_ours_gets_another_one(arm):

@@ -24,8 +24,8 @@ _BINARY = {
 }  # fmt: skip
 """Python's sign of an operation and how tightly it binds."""
 
-_ATOM, _POWER, _UNARY = 6, 5, 4
-"""How tightly names and calls, powers, and signs in front bind."""
+_ATOM, _POWER, _UNARY, _COMPARISON = 6, 5, 4, 1
+"""How tightly names and calls, powers, signs in front, and comparisons bind."""
 
 _SAME_NAME = {
     "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "expm1", "log", "log1p", "sqrt", "abs",
@@ -181,15 +181,20 @@ def _operation(node: Node, text: Callable[[Any], _Text]) -> _Text:
         return f"{_inside(text(args[0]), 2)} {_BINARY[name][0]} {second}", 2
     if name in _BINARY and not options:
         sign, level = _BINARY[name]
-        # a - (b - c): what stands on the right binds more tightly.
-        left, right = _inside(text(args[0]), level), _inside(text(args[1]), level + 1)
-        return f"{left} {sign} {right}", level
+        # a - (b - c): what stands on the right binds more tightly. Python reads a < b < c as two
+        # comparisons of b, so a comparison within another one always has brackets.
+        is_comparison = level == _COMPARISON
+        left = _inside(text(args[0]), level + 1 if is_comparison else level)
+        return f"{left} {sign} {_inside(text(args[1]), level + 1)}", level
     if name == "pow":
         base, power = _inside(text(args[0]), _ATOM), _inside(text(args[1]), _POWER)
         return f"{base}**{power}", _POWER
     if name in ("neg", "negative"):
         return f"-{_inside(text(args[0]), _UNARY)}", _UNARY
     if name in _KEEPS_VALUE:
+        kinds = [kind for kind in (*args, *options.values()) if isinstance(kind, torch.dtype)]
+        if any(not kind.is_floating_point for kind in kinds):
+            raise ModelError("it makes whole numbers of numbers; torch.floor can be exported")
         return text(args[0])
     if name in ("zeros_like", "ones_like"):
         return ("0.0" if name == "zeros_like" else "1.0"), _ATOM

@@ -115,7 +115,7 @@ def _class_names(effects: Sequence[Effect]) -> dict[str, str]:
 
     Effects share a class if their laws are the same. Other classes of one name get numbers.
     """
-    texts = {name: "" for name in _pieces()}  # no law may replace a class of ours
+    texts = {name: "" for name in (*_pieces(), *_WRITTEN)}  # no law may replace one of ours
     result: dict[str, str] = {}
     for effect in effects:
         law = law_of(effect)
@@ -139,8 +139,11 @@ def _law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[st
     lines = []
     names = _class_names(effects)
     for effect in effects:
-        given = [f"{p.name}=values[{quoted(s)}]," for p, s in _parameters(effect)]
-        if not isinstance(law_of(effect), TracedLaw):
+        is_traced = isinstance(law_of(effect), TracedLaw)
+        # A law that was written in torch may divide by a parameter that is zero.
+        value = "np.float64(values[{}])" if is_traced else "values[{}]"
+        given = [f"{p.name}={value.format(quoted(s))}," for p, s in _parameters(effect)]
+        if not is_traced:
             given += [f"{name}={value!r}," for name, value in effect.constants.items()]
         for place in _places(simulator, effect):
             inside = "\n    ".join([f"{quoted(place)},", *given])
@@ -347,6 +350,11 @@ _IMPORTS = (
     ("typing", "Any", "ClassVar"),
 )
 """Modules of the standard library, and what the laws use of them."""
+
+_WRITTEN = {"CHANNELS", "Effects", "VALUES", "laws", "mujoco", "np"} | {
+    name for module, *names in _IMPORTS for name in (module, *names)
+}
+"""Other names in the file."""
 
 _LAWS = '''
 

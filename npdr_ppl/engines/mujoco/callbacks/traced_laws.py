@@ -8,7 +8,7 @@ to step is recorded, too.
 import keyword
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -104,6 +104,19 @@ class _Now(Commands):
         raise ModelError("it needs earlier commands")
 
 
+class _Others(Mapping[str, Any]):
+    """The other joints, which the class of a law does not get."""
+
+    def __getitem__(self, name: str) -> Any:
+        raise ModelError(f"it depends on another joint, {name}")
+
+    def __iter__(self) -> Iterator[str]:
+        raise ModelError("it depends on other joints")
+
+    def __len__(self) -> int:
+        raise ModelError("it depends on other joints")
+
+
 class _Unknown:
     """Whether a channel is a velocity, which the class of a law must not depend on."""
 
@@ -182,7 +195,8 @@ def _force(effect: ForceEffect) -> TracedLaw:
         lines += ["        return self.memory"]
     if effect.needs_joint:
         seen = [recorder.number(f) for f in ("acceleration", "inverse_inertia", "drive")]
-        begun = effect.begin_step(Joint(q, v, *seen), own, memory.stand_ins(recorder), h)
+        joint = Joint(q, v, *seen, others=_Others())
+        begun = effect.begin_step(joint, own, memory.stand_ins(recorder), h)
         lines += ["", "    def begin(self, joint: Joint) -> None:"]
         lines += ['        """Takes what the step\'s forces need of the joint."""']
         lines += ["        self.known(joint)"] if memory.leaves else []
@@ -300,17 +314,18 @@ _MEMORY = [
 _OF_JOINT = {
     "position": "np.float64(joint.position)",
     "velocity": "np.float64(joint.velocity)",
-    "step": "joint.step",
+    "step": "np.float64(joint.step)",
     "start": "joint.time - 0.5 * joint.step",
     "acceleration": "np.float64(joint.acceleration)",
     "inverse_inertia": "np.float64(joint.inverse_inertia)",
     "drive": "np.float64(joint.drive)",
 }
-_OF_COMMAND = {"start": "0.0", "command": "np.float64(command)"}
-_OF_VALUE = {"start": "0.0", "value": "np.float64(value)"}
-_OF_ERROR = {"error": "np.float64(error)"}
+_OF_COMMAND = {"start": "0.0", "command": "np.float64(command)", "step": "np.float64(step)"}
+_OF_VALUE = {"start": "0.0", "value": "np.float64(value)", "step": "np.float64(step)"}
+_OF_ERROR = {"error": "np.float64(error)", "step": "np.float64(step)"}
 _AT_REST = {"error": "np.float64(0.0)"}
-"""Where each input of a law comes from, in the file."""
+"""Where each input of a law comes from, in the file. Numbers of numpy may be divided by zero, as
+those of torch."""
 
 
 def _statements(
