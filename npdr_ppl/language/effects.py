@@ -443,7 +443,7 @@ class ServoEffect(Effect):
         """Returns the effect's own state, ``(N,)``, as a rollout begins; ``None`` if it has none.
 
         Args:
-            error: Goal minus position, ``(N,)``.
+            error: Zeros, ``(N,)``: before a rollout, the servo was at its goal.
         """
         return None
 

@@ -7,12 +7,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from pyro.distributions import Normal
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.screening.sensitivities import _probe
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.errors import ModelError
+from npdr_ppl.language.channels import Parameter
+from npdr_ppl.language.effects import ServoEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import (
     GoalAccelerationLimit,
@@ -164,6 +167,33 @@ def test_the_integral_of_a_running_rollout_is_known_from_the_recording():
     # A batch of draws has the same states, whatever the chunk.
     several = {name: own.expand(3) for name, own in given.items()}
     torch.testing.assert_close(finer.simulate(several, cut)[1], parts)
+
+
+class LateError(ServoEffect):
+    """A servo that acts on the error of the step before."""
+
+    id = "late_error"
+    parameters = (Parameter("nothing", "1", 0.0, "not used"),)
+
+    def default_priors(self, port):
+        return {"nothing": Normal(0.0, 1.0)}
+
+    def initial_memory(self, error):
+        return error
+
+    def act(self, error, parameters, memory):
+        return memory
+
+    def next_memory(self, error, parameters, memory, time_step):
+        return error
+
+
+def test_a_servo_with_a_state_begins_a_rollout_at_its_goal():
+    simulator = joint().with_effects(LateError("goal"))
+    given = {"goal.late_error.nothing": value(0.0)}
+    moved = simulator.simulate(given, goals(np.full(2, 0.4), 0.4)) - value([0.4, 0.0])
+    fallen = joint('<motor name="goal" joint="hinge"/>').simulate({}, goals([0.0], 0.4))
+    torch.testing.assert_close(moved[:, :1], fallen - value([0.4, 0.0]), atol=1e-4, rtol=0.0)
 
 
 def test_a_force_limit_is_that_of_the_file():

@@ -111,8 +111,9 @@ class ServoErrors:
         self._address = {a: int(model.jnt_qposadr[joint]) for a, joint in joints.items()}
 
     def initial_memory(self) -> tuple[Tensor | None, ...]:
-        """Returns the own state of each effect as a rollout begins."""
-        return tuple(effect.initial_memory(self._error(k)) for _, effect, k in self._effects)
+        """Returns the own state of each effect as a rollout begins, at its servo's goal."""
+        at_goal = torch.zeros(len(self._goals), dtype=torch.float64)
+        return tuple(effect.initial_memory(at_goal) for _, effect, _ in self._effects)
 
     def apply(
         self, tables: Tables, memory: tuple[Tensor | None, ...], time_step: float
