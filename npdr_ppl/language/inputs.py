@@ -51,9 +51,10 @@ class Inputs:
             were, at the end of the step.
         lateness: Time from the end of the step to the measurement, in steps, ``(S, K, C)``.
         recorded_actions: Commands of whole rollouts, zero beyond their ends, ``(R, T, A)``; states
-            that sum up the whole past, such as a servo's integral, need them.
+            that sum up the whole past, such as a servo's integral, need them. ``None`` if there is
+            no recording, or if they would take more than 32 MiB.
         recorded_readings: Measurements before each step of whole rollouts, ``(R, T, C)``; forces
-            and servos that depend on past motion need them. ``None`` if the motion is unknown.
+            and servos that depend on past motion need them. ``None`` likewise.
     """
 
     actions: Tensor
@@ -95,6 +96,13 @@ class Inputs:
                 (self.past_actions.shape[-3], self.past_actions.shape[-1]),
             ),
         }
+        for name, columns in (
+            ("recorded_actions", self.action_names),
+            ("recorded_readings", self.channel_names),
+        ):
+            value = getattr(self, name)
+            if value is not None:
+                expected[name] = ((*value.shape[:2], len(columns)), tuple(value.shape))
         for name, (want, got) in expected.items():
             if want != got and tuple(want) != tuple(got):
                 raise ShapeError(f"Inputs.{name} should have shape {want}, got {got}.")
@@ -232,7 +240,7 @@ class Inputs:
         """
         if self.recorded_readings is None or name not in self.channel_names:
             return None
-        rows = (self.start - steps[:, None]).clamp_min(0)
+        rows = (self.start - steps.to(self.start.device)[:, None]).clamp_min(0)
         return self.recorded_readings[self.rollout, rows, self.channel_names.index(name)]
 
     def element(self, index: int) -> "Inputs":
@@ -241,15 +249,15 @@ class Inputs:
             return self
         depth = len(self.batch_shape)
 
-        def chosen(value: Tensor) -> Tensor:
-            event = value.shape[depth:]
+        def chosen(value: Tensor, num_own: int = 2) -> Tensor:
+            event = value.shape[-num_own:]  # some values may be those of all elements
             return value.expand(self.batch_shape + event).flatten(0, depth - 1)[index]
 
         return replace(
             self,
             **self._starts(chosen),
-            actions=chosen(self.actions),
-            past_actions=chosen(self.past_actions),
+            actions=chosen(self.actions, 3),
+            past_actions=chosen(self.past_actions, 3),
         )
 
     def measured(self, names: Sequence[str]) -> Tensor:

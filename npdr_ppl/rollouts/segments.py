@@ -142,22 +142,27 @@ def cut(
         mask=torch.tensor(mask),
         rollout=torch.tensor([rollout for rollout, _, _ in layout]),
         start=torch.tensor([start for _, start, _ in layout]),
-        recorded_actions=_padded(rollouts.actions, max(rollouts.lengths), dtype),
-        recorded_readings=_recorded(rollouts, dtype),
+        **_whole_rollouts(rollouts, dtype),
         **sampling,
         **{name: torch.tensor(value, dtype=dtype) for name, value in starts.items()},
     )
 
 
-def _recorded(rollouts: Recording, dtype: torch.dtype) -> Tensor | None:
-    """Returns what was measured before each step, ``(R, T, C)``; missing values are interpolated.
-
-    ``None`` if they would take more than 32 MiB.
-    """
+def _whole_rollouts(rollouts: Recording, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Returns commands and measurements of whole rollouts, each unless it takes over 32 MiB."""
     num_steps = max(rollouts.lengths)
+    most = _MOST_PAST_VALUES / (len(rollouts) * num_steps)
+    found: dict[str, Tensor] = {}
+    if len(rollouts.action_names) <= most:
+        found["recorded_actions"] = _padded(rollouts.actions, num_steps, dtype)
+    if len(rollouts.channel_names) <= most:
+        found["recorded_readings"] = _recorded(rollouts, num_steps, dtype)
+    return found
+
+
+def _recorded(rollouts: Recording, num_steps: int, dtype: torch.dtype) -> Tensor:
+    """Returns the measurements before each step, ``(R, T, C)``; missing ones are interpolated."""
     result = np.zeros((len(rollouts), num_steps, len(rollouts.channel_names)))
-    if result.size > _MOST_PAST_VALUES:
-        return None
     for row, readings in zip(result, rollouts.readings, strict=True):
         for column, values in zip(row.T, readings[:num_steps].T, strict=True):
             known = np.isfinite(values).nonzero()[0]

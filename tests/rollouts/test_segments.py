@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -5,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from npdr_ppl.errors import DataError, ShapeError
-from npdr_ppl.rollouts import Rollouts, stitch
+from npdr_ppl.rollouts import Rollouts, segments, stitch
 from npdr_ppl.rollouts.segments import default_history
 
 torch.set_num_threads(1)
@@ -93,6 +95,62 @@ def test_observation_of_chosen_segments_and_channels():
         rollouts.observation(inputs, ["c7"])
     with pytest.raises(DataError, match="other rollouts"):
         rollouts[0].observation(inputs)
+
+
+def before(inputs, name, back):
+    """What was measured some steps before each segment, or when its rollout began."""
+    steps = (inputs.start - back).clamp_min(0)
+    return 1000.0 * (inputs.rollout.double() + 1.0) + steps + 0.1 * int(name[1:])
+
+
+def test_inputs_that_were_cut_moved_or_reduced_keep_the_past_of_their_rollouts():
+    inputs = counting((5, 3, 7), channels=3, actions=2).inputs(2, "recorded")
+    devices = replace(
+        inputs,
+        actions=torch.stack((inputs.actions, -inputs.actions)),
+        past_actions=torch.stack((inputs.past_actions, -inputs.past_actions)),
+    )
+    variants = {
+        "themselves": inputs,
+        "chosen segments": inputs.segments([5, 0, 3]),
+        "a slice": inputs.segments(slice(2, None, 2)),
+        "other channels": inputs.select_channels(["c2", "c0"]),
+        "both": inputs.segments([6, 2]).select_channels(["c0"]),
+        "another type": inputs.to(dtype=torch.float32),
+        "one of several devices": devices.element(1),
+        "segments of several devices": devices.segments([4, 1]),
+        "with drawn starts": inputs.with_drawn_start(torch.Size((4,))),
+    }
+    for what, changed in variants.items():
+        for name in changed.channel_names:
+            found = changed.earlier(name, torch.tensor([3, 1]))
+            expected = torch.stack([before(changed, name, 3), before(changed, name, 1)])
+            assert torch.equal(found, expected.to(found)), (what, name)
+        goals = changed.recorded_actions[changed.rollout, changed.start].abs()
+        assert torch.equal(
+            goals.expand_as(changed.actions[..., 0, :]), changed.actions[..., 0, :].abs()
+        ), what
+    assert inputs.select_channels(["c0"]).earlier("c1", torch.tensor([1])) is None
+
+
+def test_the_past_of_whole_rollouts_takes_little_memory(monkeypatch):
+    # Four rollouts of five padded steps with one action and two channels.
+    rollouts = counting((5, 3, 2, 1))
+    for most, has_actions, has_readings in (
+        (40, True, True),
+        (39, True, False),
+        (19, False, False),
+    ):
+        monkeypatch.setattr(segments, "_MOST_PAST_VALUES", most)
+        inputs = rollouts.inputs(2, "recorded")
+        assert (inputs.recorded_actions is not None) == has_actions
+        assert (inputs.recorded_readings is not None) == has_readings
+
+
+def test_the_past_of_other_channels_is_refused():
+    inputs = counting((5, 3)).inputs(2, "recorded")
+    with pytest.raises(ShapeError, match="recorded_readings should have shape"):
+        replace(inputs, recorded_readings=inputs.recorded_readings[..., :1])
 
 
 @pytest.mark.parametrize(
