@@ -71,9 +71,10 @@ def _role_of_sensor(channel: Channel) -> Role:
 def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict[str, Match]:
     """Returns the signals that a model's columns probably are, by the name of the column.
 
-    Two names match if they have the same role and all words of the column's name that tell joints
-    apart, such as ``shoulder`` of ``shoulder_command``, are among the words of the signal. Of
-    several such signals, the one with the fewest other words is taken.
+    A signal with the name of a column is that column. Two other names match if they have the same
+    role and all words of the column's name that tell joints apart, such as ``shoulder`` of
+    ``shoulder_command``, are among the words of the signal. Of several such signals, the one with
+    the fewest other words is taken.
 
     Columns of a role that do not match are taken in the order of the log if there are as many
     signals of this role, and no name contradicts it. Numbers do not contradict, because some count
@@ -83,7 +84,15 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
         columns: The columns.
         signals: The signals, in the order of the log.
     """
-    result: dict[str, Match] = {}
+    by_name = {signal.name: signal for signal in signals}
+    result = {
+        column.name: Match(signal, "")
+        for column in columns
+        if (signal := by_name.get(column.name)) is not None
+        and (column.role == "command" or not signal.is_constant)
+    }
+    columns = [column for column in columns if column.name not in result]
+    signals = [signal for signal in signals if signal.name not in result]
     for role in dict.fromkeys(column.role for column in columns):
         wanted = [column for column in columns if column.role == role]
         own = [s for s in signals if s.role == role and (role == "command" or not s.is_constant)]

@@ -118,3 +118,14 @@ def test_an_effort_that_is_a_sensor_is_no_command():
     sensors = [Channel("angle", "rad"), Channel("motor_current", "A")]
     columns = columns_of(sensors, [Channel("voltage", "V")])
     assert found(columns, ["angle", "motor_current"]).keys() == {"angle", "motor_current"}
+
+
+def test_a_signal_with_the_name_of_a_column_is_that_column():
+    # No word of these names says what they are.
+    names = ["upper_arm", "shoulder", "upper_arm_position", "upper_arm_command"]
+    matches = found(COLUMNS, names)
+    assert matches["shoulder"] == ("shoulder", "")
+    assert matches["upper_arm"] == ("upper_arm", "")
+    assert matches["upper_arm_command"] == ("upper_arm_command", "")
+    signals = [SignalSummary("shoulder", "", 0.0, 0.0, "other")]
+    assert "shoulder" not in matched(COLUMNS, signals)  # it never changes
