@@ -9,6 +9,7 @@ from npdr_ppl.discovery.learning.law import Law
 from npdr_ppl.discovery.learning.memory import DELAY
 from npdr_ppl.discovery.learning.recorded_motion import PortMotion
 from npdr_ppl.discovery.learning.terms import terms_at
+from npdr_ppl.discovery.learning.terms_with_memory import series_at
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.engines.mujoco.callbacks import python_file
 from npdr_ppl.engines.mujoco.callbacks.traced_laws import trace
@@ -80,7 +81,8 @@ def learned(simulator, name, terms):
 def kinds_of_terms(simulator, name):
     """One term of every form, whatever the constants inside of it."""
     found = {}
-    for term in terms_at(motion(simulator, name)):
+    recorded = motion(simulator, name)
+    for term in (*terms_at(recorded), *series_at(recorded)):
         if term.memory == DELAY:
             continue  # refused by name: it needs earlier commands
         found[term.columns[:2], term.is_dry, term.is_spline] = term

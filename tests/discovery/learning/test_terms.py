@@ -15,6 +15,10 @@ from npdr_ppl.language.effect_context import Joint, Start
 from tests.helpers.port_motions import COMMAND, JOINT, SENSOR
 
 
+def tensor(value):
+    return torch.tensor(value, dtype=torch.float64)
+
+
 def law_with(motion, term):
     num = len(term.columns)
     coefficients = tuple(0.3 + 0.1 * k for k in range(num))
@@ -164,9 +168,18 @@ def test_a_law_has_another_name_than_effects_that_are_known():
     assert [effect.id for effect in effects] == ["learned_hinge", "learned_hinge__3"]
 
 
-def test_a_law_that_depends_on_another_joint_names_it():
+@pytest.mark.parametrize("end", ["", '"]; raise SystemExit("ran")\n"""', "\\"])
+def test_a_law_that_depends_on_another_joint_names_it(end):
     term = next(t for t in terms_at(JOINT) if t.key == "q₁ · v")
-    law = law_with(JOINT, term)
-    assert law.formula == "c₁ q₁ · v" and law.letters == {"q₁": "the position at elbow"}
+    name = f"elbow{end}"
+    law = replace(law_with(JOINT, term), others=(name,))
+    assert law.formula == "c₁ q₁ · v" and law.letters == {"q₁": f"the position at {name}"}
+    (effect,), values = effects_of([law])  # the name does not become code
+    joint = Joint(*tensor([1.0, 2.0, 0.0, 0.0, 0.0]), others={name: tensor([0.3, 0.0]).unbind()})
+    memory = effect.initial_memory(joint.position, joint.velocity, Start(tensor(0.0), 0.1, {}))
+    memory = effect.begin_step(joint, {}, memory, 0.1)
+    given = {"c1": tensor(0.5)}
+    found = effect.force(joint.position, joint.velocity, given, memory)
+    assert float(found) == pytest.approx(0.5 * 0.3 * 2.0)
     source = module_source([law], "From a test.")
-    assert "q₁ is the position at elbow." in source and 'joint.others["elbow"][0]' in source
+    assert "q₁ is the position at elbow" in source and 'joint.others["elbow' in source
