@@ -136,11 +136,16 @@ def test_integral_action_sums_up_the_error_up_to_its_limit(limit):
     assert float((expected - other).abs().max()) > 1e-3
 
 
-def test_the_integral_of_a_running_rollout_is_known_from_the_recording():
-    """A segment that begins later continues the sum, with its limit, over the whole past."""
+@pytest.mark.parametrize("more", [(), (ServoDeadBand("goal"),)])
+def test_the_integral_of_a_running_rollout_is_known_from_the_recording(more):
+    """A segment that begins later continues the sum, with its limit, over the whole past.
+
+    After a dead band, the sum is that of the errors beyond it.
+    """
     effect = IntegralAction("goal")
-    simulator = joint().with_effects(effect)
+    simulator = joint().with_effects(*more, effect)
     given = {f"{effect.name}.{name}": value(own) for name, own in INTEGRAL.items()}
+    given |= {f"{band.name}.width": value(0.02) for band in more}
     commands = 0.3 * np.sin(np.linspace(0.0, 20.0, 4000)) + 0.2
     (whole,) = simulator.simulate(given, goals(commands))
     rollouts = npdr.Rollouts.from_arrays(

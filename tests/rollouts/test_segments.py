@@ -131,6 +131,8 @@ def test_inputs_that_were_cut_moved_or_reduced_keep_the_past_of_their_rollouts()
             goals.expand_as(changed.actions[..., 0, :]), changed.actions[..., 0, :].abs()
         ), what
     assert inputs.select_channels(["c0"]).earlier("c1", torch.tensor([1])) is None
+    elsewhere = inputs.to(device="meta")
+    assert elsewhere.earlier("c0", torch.tensor([3, 1])).shape == (2, inputs.num_segments)
 
 
 def test_the_past_of_whole_rollouts_takes_little_memory(monkeypatch):

@@ -23,9 +23,10 @@ def with_recorded_past(
 ) -> tuple[Tensor | None, ...]:
     """Returns the own states of servo effects at the start of segments.
 
-    Each effect gets the errors of its servo in every step since the rollout began: the recorded
-    goal minus the measured position. Without a record, or if the joint's position was not
-    measured, its state stays that of a rollout's beginning.
+    The first effect of a servo gets its error in every step since the rollout began: the recorded
+    goal minus the measured position. A later effect gets the error that the one before it gives.
+    Without a record, or if the joint's position was not measured, states stay those of a rollout's
+    beginning.
 
     Args:
         simulator: The simulator with its effects.
@@ -36,25 +37,27 @@ def with_recorded_past(
         memory: Own state of each servo effect as a rollout begins, ``(n,)``; ``None`` for effects
             without a state.
     """
-    effects = zip(simulator.servo_effects, memory, strict=True)
+    effects = simulator.servo_effects
     if inputs.recorded_actions is None or all(own is None for own in memory):
         return memory
     rollout, start = (
         value.expand(*shape).reshape(-1)[chunk] for value in (inputs.rollout, inputs.start)
     )
-    result = []
-    for (place, effect, actuator), own in effects:
-        errors = None if own is None else _errors(simulator, inputs, actuator)
-        if own is None or errors is None:
-            result.append(own)
-            continue
-        values, state = tables.effects[place], own
-        for step in range(int(start.max())):
-            later = effect.next_memory(errors[step][rollout], values, state, inputs.time_step)
-            assert later is not None
-            state = torch.where(step < start, later, state)
-        result.append(state)
-    return tuple(result)
+    with_state = {a for (*_, a), own in zip(effects, memory, strict=True) if own is not None}
+    found = {actuator: _errors(simulator, inputs, actuator) for actuator in with_state}
+    known = {actuator: errors for actuator, errors in found.items() if errors is not None}
+    states = list(memory)
+    for step in range(int(start.max()) if known else 0):
+        present = {actuator: errors[step][rollout] for actuator, errors in known.items()}
+        for number, (place, effect, actuator) in enumerate(effects):
+            if actuator not in known:
+                continue
+            error, values, own = present[actuator], tables.effects[place], states[number]
+            present[actuator] = effect.act(error, values, own)
+            later = effect.next_memory(error, values, own, inputs.time_step)
+            if own is not None and later is not None:
+                states[number] = torch.where(step < start, later, own)
+    return tuple(states)
 
 
 def _errors(simulator: MujocoMechanism, inputs: Inputs, actuator: int) -> Tensor | None:
