@@ -332,6 +332,14 @@ class Tabulated(Creeping):
         return (table * commands.now()).sum() * parameters["share"], memory
 
 
+class Noisy(Creeping):
+    """A law with a random number."""
+
+    def act(self, commands, parameters, memory, time_step):
+        """Scatters the command."""
+        return commands.now() + parameters["share"] * torch.randn(()), memory
+
+
 class Reserved(Creeping):
     """A parameter that has the name of something in the file."""
 
@@ -353,6 +361,7 @@ class Coarse(Creeping):
         (Delayed, "needs earlier commands"),
         (Tabulated, "it uses sum"),
         (Coarse, "it makes whole numbers of numbers"),
+        (Noisy, "it draws random numbers"),
         (Reserved, 'parameter "memory" has a name that the file needs itself'),
     ],
 )

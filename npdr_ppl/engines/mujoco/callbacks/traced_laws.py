@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import torch
+
 from npdr_ppl.engines.mujoco.callbacks.numpy_source import Recorder
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effect_context import Joint, Start
@@ -76,8 +78,15 @@ def trace(effect: Effect) -> TracedLaw:
     }  # fmt: skip
     for kind, writer in writers.items():
         if isinstance(effect, kind):
+            before = torch.get_rng_state()
             try:
-                return writer(effect)
+                found = writer(effect)
+                if not torch.equal(before, torch.get_rng_state()):
+                    torch.set_rng_state(before)
+                    raise ModelError(
+                        "it draws random numbers, of which one would stay in the file"
+                    )
+                return found
             except ModelError:
                 raise
             except Exception as error:
