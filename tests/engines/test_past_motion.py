@@ -52,6 +52,26 @@ def test_displacements_are_those_of_the_recorded_positions(rig):
     assert set(witness.others) == {"arm"}
 
 
+@pytest.mark.parametrize("rig", ["furuta", "furuta_mujoco"])
+def test_the_past_of_a_segment_is_the_same_among_other_segments(rig):
+    inputs = make_case("furuta", "null", seed=3).fit.inputs(100)
+    witness = Witness("pole")
+    simulator = RIGS[rig].simulator().with_effects(witness)
+    given = {"pole.witness.nothing": torch.zeros(())}
+    simulator.simulate(given, inputs)
+    every = witness.start
+    some = inputs.segments([5, 2])
+    assert int(some.start.max()) < int(inputs.start.max())
+    simulator.simulate(given, some)
+    assert witness.start.interval == every.interval
+    for own, among in zip(
+        reversed(witness.start.displacements), reversed(every.displacements), strict=False
+    ):
+        assert torch.equal(own, among[[5, 2]])
+    num = len(witness.start.displacements)
+    assert not any(bool(moved[[5, 2]].any()) for moved in every.displacements[:-num])
+
+
 def test_nothing_is_told_where_no_recording_is():
     inputs = make_case("furuta", "null", seed=3).fit.inputs(100)
     witness = Witness("pole")

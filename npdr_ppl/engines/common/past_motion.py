@@ -56,10 +56,12 @@ def past_motion(
         shape: Shape of the batch and the segments, of numel N.
         dtype: Floating type of the simulation.
     """
-    if not any(channels):
+    if not any(channels) or inputs.recorded_readings is None:
         return PastMotion()
-    num_steps = min(round(_PAST_SECONDS / inputs.time_step), int(inputs.start.max()))
-    stride = max(1, -(-num_steps // _MOST_INTERVALS))
+    most = round(_PAST_SECONDS / inputs.time_step)
+    # The length of the rollouts: a segment's past does not depend on what it is simulated with.
+    stride = max(1, -(-min(most, inputs.recorded_readings.shape[-2]) // _MOST_INTERVALS))
+    num_steps = min(most, int(inputs.start.max()))
     steps = stride * torch.arange(-(-num_steps // stride), -1, -1)
     found = []
     for name in channels:
