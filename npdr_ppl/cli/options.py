@@ -42,7 +42,9 @@ __all__ = [
     "OptionalModelArgument",
     "OptionalRoundsOption",
     "OptionalSimulationsOption",
+    "OptionalRolloutsOption",
     "OutOption",
+    "RolloutsOption",
     "Precision",
     "PrecisionOption",
     "RoundsOption",
@@ -102,6 +104,13 @@ OutOption = Annotated[
         help="Folder for results; file for the rollouts of convert and the commands of plan."
     ),
 ]
+_ROLLOUTS = typer.Option(
+    min=1,
+    help="Rollouts to record: by train in each iteration; for plan, by default one, or as many as "
+    "tell several causes apart, at most 6.",
+)
+RolloutsOption = Annotated[int, _ROLLOUTS]
+OptionalRolloutsOption = Annotated[int | None, _ROLLOUTS]
 HoldoutOption = Annotated[
     str, typer.Option(help="Rollouts to hold out and to test on, e.g. 3,4; counted from 0.")
 ]

@@ -8,7 +8,7 @@ import typer
 
 from npdr_ppl.cli.manners import AsJson, Quiet
 from npdr_ppl.cli.names import complete_model
-from npdr_ppl.cli.options import EffectOption, OutOption, SeedOption
+from npdr_ppl.cli.options import EffectOption, OptionalRolloutsOption, OutOption, SeedOption
 from npdr_ppl.errors import DataError
 
 __all__ = ["plan"]
@@ -36,14 +36,7 @@ def plan(
         bool,
         typer.Option("--print-limits", help="Print the limits as TOML, to edit them, and end."),
     ] = False,
-    rollouts: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Rollouts of the recording. Without it, one, or as many as tell several causes "
-            "apart, at most 6.",
-        ),
-    ] = None,
+    rollouts: OptionalRolloutsOption = None,
     effect: EffectOption = None,
     batches: Annotated[
         int, typer.Option(min=1, help="Batches of excitations that are tried.")

@@ -172,7 +172,8 @@ def test_a_search_reports_its_progress_to_a_larger_workflow():
     Investigation(pendulum, rollouts, search=search, progress=told).first  # noqa: B018
     fractions = [f for f in told.told["screen candidates"] if f is not None]
     assert fractions == sorted(fractions) and fractions[0] == 0.0 < fractions[-1] < 1.0
-    assert told.told["fit the original model"][0] == 0.0
+    # The check of the recording, which comes first, says what it does without a fraction.
+    assert next(f for f in told.told["fit the original model"] if f is not None) == 0.0
 
 
 def test_what_a_model_or_a_training_needs_is_exported():

@@ -60,8 +60,9 @@ def test_a_fit_runs_the_program_once_for_each_use_and_smooths_no_place_twice(cas
     quick = backend("snpe-c", transforms=1, hidden=(8,), epochs=1, members=1)
     fit(pendulum, case.fit[:2], backend=quick, num_simulations=20, progress=False)
     # The model without its noise, for the repair and for the fit; the same with finer steps of
-    # two kinds, along a part and along the whole recording; and with wider priors.
-    assert 3 <= _number(calls, "_trace") <= 7
+    # two kinds, along a part and along the whole recording; with wider priors; and in midpoint
+    # steps, for the screening, the draws and the scores.
+    assert 3 <= _number(calls, "_trace") <= 10
     # These, the model whose simulator is looked at, the model that is tried out, the model with
     # its own noise, the model with estimated noise, and the scores.
     assert _number(calls, "traces") == _number(calls, "_trace") + 5
@@ -89,7 +90,8 @@ def test_a_preparation_is_bound_once_however_often_it_is_used(case, calls):
         for seed in (0, 1)
     ]
     assert posteriors[0].bound is posteriors[1].bound
-    assert _number(calls, "traces") == before + 1
+    # The scores' model, and the same in midpoint steps.
+    assert _number(calls, "traces") == before + 2
 
 
 def test_a_fit_starts_no_processes_to_look_at_a_recording_once(case, monkeypatch):
@@ -111,8 +113,10 @@ def test_refits_of_a_model_do_not_run_the_program_again(case, calls):
     base = searcher.fit_base()
     assert _number(calls, "traces") == 1
     ranking = searcher.look(base).ranking
+    # Screening simulates the model in midpoint steps: one for the candidates, one for pulses.
+    assert _number(calls, "traces") == 3
     trials = fit_shortlist(searcher.trials, base, ranking)
-    number = 1 + len(trials)
+    number = 3 + len(trials)
     assert _number(calls, "traces") == number
     trials = fit_contenders(searcher.trials, trials, base)
     number += len(trials)  # once more along all segments
