@@ -17,7 +17,7 @@ from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Parameter
 from npdr_ppl.language.effects import ActionEffect, ForceEffect, SensorEffect, ServoEffect
-from npdr_ppl.models.effects import effects
+from npdr_ppl.models.effects import InputDelay, effects
 from tests.helpers.exported_robots import ARM, attachable, difference, probed, refusals
 
 MOST = 1e-4
@@ -415,3 +415,8 @@ def test_a_class_with_a_name_of_ours_gets_another_one(arm):
     assert found is not None
     assert found.text.count("class Warming(JointLaw):") == 1
     assert "class Spring2(JointLaw):" in found.text
+
+
+def test_a_copy_of_an_effect_of_the_catalogue_in_a_revised_model_is_that_effect():
+    copied = type("InputDelay", (InputDelay,), {"__module__": "revised_model"})
+    assert python_file.law_of(copied("motor")) is python_file.LAWS["input_delay"]
