@@ -442,7 +442,7 @@ _LIMITS = {
     "channels": "positions and speeds",
     "bandwidth": "bandwidth",
 }
-"""Kinds of limits, as a person is told."""
+"""Kinds of limits, in words."""
 
 _LEAST_GAIN = 0.1
 """Gain of chance from which wider limits are recommended; the chances have standard errors of

@@ -1,4 +1,4 @@
-"""Forces that remember are told how their joint moved before a segment."""
+"""Forces with a memory get the motion of their joint before a segment."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from npdr_ppl.language.effects import ForceEffect
 
 
 class Witness(ForceEffect):
-    """No force: it keeps what it is told."""
+    """An effect without a force, which keeps the past motion that it gets."""
 
     id = "witness"
     needs_past = True
