@@ -8,6 +8,7 @@ import pytest
 
 from tests.cli.test_robot_files import write_arm
 from tests.helpers.command_line import run_for_module
+from tests.helpers.effect_files import DAMPING
 
 
 def write_fit(folder, parameters):
@@ -148,25 +149,7 @@ def test_bad_input_gives_one_sentence(fitted, monkeypatch, words, sentence):
     assert code == 2 and err.count("\n") == 1 and sentence in err
 
 
-OWN_EFFECT = '''
-import pyro.distributions as dist
-import torch
-from npdr_ppl.language.channels import Parameter
-from npdr_ppl.language.effects import ForceEffect
-
-
-class CubicDamping(ForceEffect):
-    """A law of the user's."""
-
-    id = "cubic_damping"
-    parameters = (Parameter("damping", "N m s³/rad³", 0.0),)
-
-    def default_priors(self, port):
-        return {"damping": dist.Normal(0.0, 1.0)}
-
-    def force(self, position, velocity, parameters, memory):
-        return -parameters["damping"] * velocity**3
-
+OWN_EFFECTS = f'''{DAMPING}
 
 class Reporting(CubicDamping):
     """A law that cannot be followed."""
@@ -182,7 +165,7 @@ class Reporting(CubicDamping):
 def with_own_effect(fitted):
     """The folder with a file of two effects, and a run for each."""
     folder, _ = fitted
-    (folder / "own.py").write_text(OWN_EFFECT)
+    (folder / "own.py").write_text(OWN_EFFECTS)
     for name in ("cubic_damping", "reporting"):
         site = f"shoulder_torque.{name}.damping"
         write_fit(folder / name, {"kp": 44.0, site: 0.3})

@@ -18,6 +18,7 @@ from npdr_ppl.policies.linear import Linear
 from npdr_ppl.policies.power import PoWER
 from tests.helpers import isaac_lab_stub
 from tests.helpers.command_line import run_for_module
+from tests.helpers.effect_files import DAMPING
 from tests.helpers.exported_runs import (
     MEANS,
     NUM_DRAWS,
@@ -175,26 +176,8 @@ def test_the_environment_moves_as_our_simulator_with_the_same_draw(draws):
         assert np.abs(wanted - nominal).max() > 0.1
 
 
-OWN_EFFECT = """
-import pyro.distributions as dist
-from npdr_ppl.language.channels import Parameter
-from npdr_ppl.language.effects import ForceEffect
-
-
-class CubicDamping(ForceEffect):
-    id = "cubic_damping"
-    parameters = (Parameter("damping", "N m s³/rad³", 0.0),)
-
-    def default_priors(self, port):
-        return {"damping": dist.Normal(0.0, 1.0)}
-
-    def force(self, position, velocity, parameters, memory):
-        return -parameters["damping"] * velocity**3
-"""
-
-
 def test_an_effect_of_ones_own_acts_in_the_environment_with_the_value_of_the_draw(draws):
-    Path("own.py").write_text(OWN_EFFECT)
+    Path("own.py").write_text(DAMPING)
     site = "shoulder_torque.cubic_damping.damping"
     names = ("mass", "damping", "kp", "centre", "density", "grip")
     drawn = write_fit(Path("own"), {name: MEANS[name] for name in names} | {site: 0.5})

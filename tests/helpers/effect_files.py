@@ -76,3 +76,24 @@ class Shifted(SensorEffect):
     def read(self, value, parameters, memory, time_step):
         return hat(value, parameters["shift"]), memory
 '''
+
+DAMPING = '''"""An effect of a user's own."""
+
+import pyro.distributions as dist
+
+from npdr_ppl.language.channels import Parameter
+from npdr_ppl.language.effects import ForceEffect
+
+
+class CubicDamping(ForceEffect):
+    """−c v³."""
+
+    id = "cubic_damping"
+    parameters = (Parameter("damping", "N m s³/rad³", 0.0),)
+
+    def default_priors(self, port):
+        return {"damping": dist.Normal(0.0, 1.0)}
+
+    def force(self, position, velocity, parameters, memory):
+        return -parameters["damping"] * velocity**3
+'''

@@ -1,12 +1,8 @@
 """Friction of every joint of an arm, from one motion of all joints, without simulations.
 
-The torques of a rigid arm are linear in its inertial and friction parameters π; see
-:mod:`npdr_ppl.engines.mujoco.base_parameters`. With a constant torque c for each joint,
-
-    Y(q, v, v̇) π + c = τ,
-
-is solved by least squares. No value of π is taken from the file, so wrong masses do not change the
-result. The friction of joint j is f sign v_j + d v_j.
+The equation Y π + c = τ of :mod:`~npdr_ppl.engines.mujoco.torque_regression` is solved by least
+squares. No value of π is taken from the file, so wrong masses do not change the result. The
+friction of joint j is f sign v_j + d v_j.
 
 Reference: C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of
 manipulator loads and links, 1986, Section 2.
@@ -20,7 +16,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.engines.mujoco.base_parameters import INERTIAL, JOINT, MujocoInverseDynamics
 from npdr_ppl.engines.mujoco.fields import element_names
-from npdr_ppl.engines.mujoco.payload import (
+from npdr_ppl.engines.mujoco.torque_regression import (
     SINGULAR,
     least_squares,
     load_robot,
