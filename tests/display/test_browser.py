@@ -100,9 +100,8 @@ def test_the_first_screen_has_verdict_curves_and_gap(opened):
 def test_a_link_to_a_folded_section_unfolds_it(opened):
     page = opened("arm")
     page.get_by_role("link", name="Provenance").click()
-    assert (
-        page.locator("section:has(h2:text-is('Provenance')) details").get_attribute("open") == ""
-    )
+    section = "section:has(h2:text-is('Provenance'))"
+    page.wait_for_selector(f"{section} details[open]", timeout=5000)  # milliseconds
 
 
 @pytest.mark.slow
