@@ -41,6 +41,7 @@ from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
+from npdr_ppl.preparation.data_options import FEWEST_STEPS, SEGMENT_SECONDS, DataOptions
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""
@@ -247,7 +248,7 @@ def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
         catalogue: Effects that a search may add to the model before it is judged.
     """
     options = npdr.DiscoveryOptions(effects=catalogue)
-    searcher = Searcher(case.model, case.fit, options)
+    searcher = Searcher(case.model, case.fit, options, data_options=_segments(case))
     hidden, null = searcher.fit_base(), _quiet(case.rig, case.seed)
     if catalogue:
         hidden = searcher.run(searcher.look(hidden), max_effects=options.max_effects).final
@@ -261,7 +262,8 @@ def _separation_of_each(case: Case) -> float:
 
     The model's parameters and those of the effect are refitted.
     """
-    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
+    options = npdr.DiscoveryOptions()
+    searcher = Searcher(case.model, case.fit, options, data_options=_segments(case))
     base, null = searcher.fit_base(), _quiet(case.rig, case.seed)
     known = {effect.name: effect for effect in candidate_effects(base.simulator)}
     distances = []
@@ -281,7 +283,13 @@ def _separation_of_each(case: Case) -> float:
 def _quiet(rig: str, seed: int) -> Hypothesis:
     """Returns the fit to a case without anything hidden; every strength is compared with it."""
     case = make_case(rig, "null", (), seed=seed)
-    return Searcher(case.model, case.fit, npdr.DiscoveryOptions()).fit_base()
+    options = npdr.DiscoveryOptions()
+    return Searcher(case.model, case.fit, options, data_options=_segments(case)).fit_base()
+
+
+def _segments(case: Case) -> DataOptions:
+    """Returns segments of the same length whatever is hidden, so that losses can be compared."""
+    return DataOptions(None, max(FEWEST_STEPS, round(SEGMENT_SECONDS / case.fit.time_step)))
 
 
 def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:

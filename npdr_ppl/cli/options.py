@@ -151,7 +151,8 @@ EmbeddingOption = Annotated[
 SegmentLengthOption = Annotated[
     str,
     typer.Option(
-        help="Steps between re-synchronisations: a number, auto (0.2 s), or 0 for whole rollouts."
+        help="Steps between re-synchronisations: a number, auto (0.2 s, or more where the motion "
+        "is slow), or 0 for whole rollouts."
     ),
 ]
 InitialStateOption = Annotated[InitialState, typer.Option(help="State at a segment's start.")]

@@ -27,16 +27,17 @@ not fit in the cache, and the allocator maps their memory again every time. With
 overhead of the calls dominates."""
 
 SEGMENT_SECONDS = 0.2
-"""Default length of a segment in s. It is long compared with delays and lags, and short compared
-with the time in which an unstable motion amplifies errors of the initial state."""
+"""Least default length of a segment in s. It is long compared with delays and lags, and short
+compared with the time in which an unstable motion amplifies errors of the initial state."""
 
 FEWEST_STEPS, MOST_STEPS = 20, 200
 """Bounds of a segment's default length in steps. Shorter segments need most of their measurements
 for their initial states. Longer ones need more memory and contain no more information."""
 
-FEWEST_SEGMENTS = 8
-"""Least number of segments of a recording that is long enough. With fewer, a test cannot
-distinguish an effect from chance."""
+FEWEST_SEGMENTS, MANY_SEGMENTS = 8, 32
+"""Least number of segments of a recording that is long enough, and of one that is cut into longer
+segments because it is slow. With fewer than the least, a test cannot distinguish an effect from
+chance."""
 
 MOST_READINGS = 80_000
 """Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 11 s
@@ -54,12 +55,16 @@ SegmentLength = int | Literal["auto"] | None
 def default_segment_length(rollouts: Rollouts) -> int:
     """Returns the default length of a segment in steps.
 
-    It is ``SEGMENT_SECONDS``, within ``FEWEST_STEPS`` and ``MOST_STEPS``. A recording that would
-    have fewer than ``FEWEST_SEGMENTS`` segments of this length is cut into twice
-    ``FEWEST_SEGMENTS``.
+    It is ``SEGMENT_SECONDS``, or the time in which the motion goes through one radian, if that is
+    longer and leaves ``MANY_SEGMENTS``: a shorter part of a slow motion follows from its initial
+    state whatever the parameters are. It is within ``FEWEST_STEPS`` and ``MOST_STEPS``. A
+    recording that would have fewer than ``FEWEST_SEGMENTS`` segments of this length is cut into
+    twice ``FEWEST_SEGMENTS``.
     """
-    length = round(SEGMENT_SECONDS / rollouts.time_step)
-    length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), rollouts.num_usable
+    total = rollouts.num_usable
+    slow = min(rollouts.motion_time / rollouts.time_step, total // MANY_SEGMENTS)
+    length = round(max(SEGMENT_SECONDS / rollouts.time_step, slow))
+    length = max(FEWEST_STEPS, min(MOST_STEPS, length))
     if total >= FEWEST_SEGMENTS * length:
         return length
     return max(2, min(length, total // (2 * FEWEST_SEGMENTS)))

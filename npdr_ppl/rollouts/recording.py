@@ -13,6 +13,7 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.rollouts import rollout_checks, states
 from npdr_ppl.rollouts.arrays import Array, as_arrays, frozen
+from npdr_ppl.rollouts.motion_time import motion_time
 from npdr_ppl.rollouts.sampling import Sampling, Spans
 from npdr_ppl.rollouts.states import StateEstimate
 
@@ -154,6 +155,11 @@ class Recording:
     def rate_changes(self) -> Array:
         """Root-mean-square change of each channel's rate during a time step, ``(C,)``."""
         return states.rate_changes(self.usable_readings, self.time_step)
+
+    @cached_property
+    def motion_time(self) -> float:
+        """Time in s in which the motion goes through one radian; see :func:`motion_time`."""
+        return motion_time(self.usable_readings, self.time_step)
 
     @property
     def spans(self) -> tuple[Spans, ...]:

@@ -14,6 +14,7 @@ from npdr_ppl.discovery.screening.moments import forces_at_moments
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.settings import ALARM, MOMENT_TEST
 from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.preparation.data_options import DataOptions
 
 SEED = 2000
 """No seed of the benchmark's, neither of its tuning nor of its reporting."""
@@ -22,10 +23,11 @@ HEARD = ALARM.moment_share * npdr.DiscoveryOptions().false_alarm_rate
 """From which on the alarm fires."""
 
 
-def seen(condition, places=(), rig="pendulum"):
+def seen(condition, places=(), rig="pendulum", length="auto"):
     """Returns a fitted rig, and what pulses of force would change."""
     case = make_case(rig, condition, places, strength=1.0, seed=SEED)
-    fitted = fit_hypothesis(case.model, case.fit, segment_options(case.fit))
+    options = segment_options(case.fit, DataOptions(segment_length=length))
+    fitted = fit_hypothesis(case.model, case.fit, options)
     return Projection(fitted), responses(fitted)
 
 
@@ -86,9 +88,22 @@ def test_outliers_are_seldom_taken_for_forces():
     assert min(values) > HEARD
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [46, 38, 33, 26])
+def test_a_shorter_last_segment_is_no_sign_of_a_force(length):
+    projection, found = seen("null", length=length)
+    last = projection.num_measured.min()
+    assert last == 2 * (500 % length) < 2 * length  # an angle and a velocity per step
+    assert moments(projection, found).p_value > 0.05
+
+
 def test_segments_of_few_readings_say_nothing():
     projection, found = seen("null")
     few = MOMENT_TEST.num_directions + 1
-    short = types.SimpleNamespace(residual=projection.residual[:, :few], whitened=lambda x: x)
+    short = types.SimpleNamespace(
+        residual=projection.residual[:, :few],
+        num_measured=torch.full((len(projection.residual),), few),
+        whitened=lambda x: x,
+    )
     ports = {port: change[:, :few] for port, change in found.by_port.items()}
     assert forces_at_moments(short, dataclasses.replace(found, by_port=ports)) == []

@@ -52,23 +52,26 @@ def forces_at_moments(projection: Projection, found: Responses) -> list[Moments]
         projection: The fitted model.
         found: The responses to pulses.
     """
-    residual = projection.whitened(projection.residual[..., None])[..., 0]
-    num, size = residual.shape
-    if num < PERMUTATION_TEST.least_blocks or size < MOMENT_TEST.num_directions + 2:
+    # The last segment of a rollout may have only a few measurements.
+    large = projection.num_measured >= MOMENT_TEST.num_directions + 2
+    num, size = int(large.sum()), projection.num_measured[large]
+    if num < PERMUTATION_TEST.least_blocks:
         return []
+    residual = projection.whitened(projection.residual[..., None])[large][..., 0]
     result = []
     for port, change in found.by_port.items():
-        directions = torch.linalg.svd(projection.whitened(change), full_matrices=False)[0]
+        changes = projection.whitened(change)[large]
+        directions = torch.linalg.svd(changes, full_matrices=False)[0]
         directions = directions[..., : MOMENT_TEST.num_directions]
         shapes = directions.shape[-1]
         along, across = _energies(residual, directions)
-        freedom = size - shapes
-        usual = float((along / across).median()) * freedom / shapes
-        usual = max(1.0, usual / float(special.fdtri(shapes, freedom, 0.5)))
+        freedom = (size - shapes).double()
+        middle = torch.from_numpy(special.fdtri(shapes, freedom.numpy(), 0.5))
+        usual = max(1.0, float((along / across * freedom / shapes / middle).median()))
         along, across = _energies_without_one(residual, directions)
-        across = across / (freedom - 1)
+        across = across / (freedom - 1.0)
         ratio = along / shapes / across / usual
-        tails = torch.from_numpy(special.fdtrc(shapes, freedom - 1, ratio.numpy()))
+        tails = torch.from_numpy(special.fdtrc(shapes, freedom.numpy() - 1.0, ratio.numpy()))
         order = tails.argsort()[: MOMENT_TEST.most_segments]
         least = tails[order].numpy()
         together = special.bdtrc(np.arange(len(order)), num, least)

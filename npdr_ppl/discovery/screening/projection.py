@@ -84,6 +84,13 @@ class Projection:
         self._information = (by_z.mT @ self._weights).sum(0) + prior
         self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
+    @cached_property
+    def num_measured(self) -> Tensor:
+        """Number of rows of each segment that were measured, ``(S,)``; the others are zero."""
+        segments = self.hypothesis.segments
+        ones = torch.ones_like(segments.observed)
+        return (segments.whitened(ones, torch.ones_like(ones[0, 0])) > 0.0).sum(-1)
+
     def projected(self, columns: Tensor) -> Tensor:
         """Returns C^-½ x minus the part that refitted parameters explain.
 
