@@ -55,9 +55,9 @@ SegmentLength = int | Literal["auto"] | None
 def default_segment_length(rollouts: Rollouts) -> int:
     """Returns the default length of a segment in steps.
 
-    It is ``SEGMENT_SECONDS``, or the time in which the motion goes through one radian, if that is
-    longer and leaves ``MANY_SEGMENTS``: a shorter part of a slow motion follows from its initial
-    state whatever the parameters are. It is within ``FEWEST_STEPS`` and ``MOST_STEPS``. A
+    It is ``SEGMENT_SECONDS``, or the time after which the motion is no longer a straight line, if
+    that is longer and leaves ``MANY_SEGMENTS``: a shorter part of a slow motion follows from its
+    initial state whatever the parameters are. It is within ``FEWEST_STEPS`` and ``MOST_STEPS``. A
     recording that would have fewer than ``FEWEST_SEGMENTS`` segments of this length is cut into
     twice ``FEWEST_SEGMENTS``.
     """

@@ -4,48 +4,66 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import correlate
 
 from npdr_ppl.rollouts.arrays import Array
 
 __all__ = ["motion_time"]
 
-RADIAN = math.cos(1.0)
-"""Autocorrelation of a sine after one radian of its phase."""
+BENT = 2.0 * (1.0 - math.cos(1.0))
+"""Mean square of a sine's second differences over a radian of its phase, relative to that of its
+first differences; 3 for noise, whatever the time."""
+
+MOST_LAGS = 200
+"""Greatest number of steps of a time that is looked for."""
+
+MOST_DIFFERENCES = 20_000
+"""Number of differences that are averaged for a lag; more change nothing and take longer."""
 
 
 def motion_time(stretches: Sequence[Array], time_step: float) -> float:
-    """Returns the time in s in which a motion goes through one radian of its main wave.
+    """Returns the time in s after which a motion is no longer a straight line.
 
-    It is the first time after which the autocorrelation of a channel is that of a sine after one
-    radian, 1/(2π f) for a frequency f; and the median of several channels. A channel whose
-    neighbouring measurements correlate less than that is noise, and one that never changes is
-    none; they do not count. If none is left, the time is 0.
+    Over shorter times, a channel's values follow from the value and the rate at the beginning. A
+    sine of frequency f has the time 1/(2π f), which is one radian of its phase. Several channels
+    have the median. Noise and channels that stand still have no such time; if all are of this
+    kind, it is 0. It is at most ``MOST_LAGS`` steps.
 
     Args:
         stretches: Measurements without gaps, ``(N, C)`` each.
         time_step: Seconds between them.
     """
-    columns = range(stretches[0].shape[1])
-    lags = [_lag([values[:, column] for values in stretches]) for column in columns]
-    moving = [lag for lag in lags if lag > 1]
+    bent = _bends(stretches)
+    lags = [_lag(column) for column in bent.T]
+    moving = [lag for lag in lags if lag]
     return time_step * float(np.median(moving)) if moving else 0.0
 
 
-def _lag(tracks: Sequence[Array]) -> int:
-    """Returns the first lag in steps at which the autocorrelation is below that of a radian.
+def _bends(stretches: Sequence[Array]) -> Array:
+    """Returns the ratios of :data:`BENT` for each lag from one step, ``(lags, C)``."""
+    longest = max(map(len, stretches))
+    rows = []
+    for lag in range(1, min(MOST_LAGS, (longest - 1) // 2) + 1):
+        once = twice = np.zeros(stretches[0].shape[1])
+        for values in stretches:
+            num = len(values) - 2 * lag
+            if num > 0:
+                every = slice(None, num, -(-num // MOST_DIFFERENCES))
+                first, middle, last = (values[k * lag :][every] for k in range(3))
+                once = once + np.square(middle - first).sum(0)
+                twice = twice + np.square(last - 2.0 * middle + first).sum(0)
+        rows.append(twice / np.maximum(once, 1e-300))
+    return np.array(rows).reshape(-1, stretches[0].shape[1])
 
-    Each track departs from its own mean. The lag is 0 if nothing changes, and the length of the
-    longest track if there is no such lag.
+
+def _lag(bent: Array) -> int:
+    """Returns the first lag at which a channel bends, after lags at which it does not.
+
+    Where noise hides that it does not bend over the shortest times, it does so over longer ones.
+    The lag is 0 if there is none at which it does not bend, or if it stands still.
     """
-    longest = max(map(len, tracks))
-    products, pairs = np.zeros(longest), np.zeros(longest)
-    for track in tracks:
-        num, departures = len(track), track - track.mean()
-        products[:num] += correlate(departures, departures)[num - 1 :]
-        pairs[:num] += np.arange(num, 0, -1)
-    covariance = products / pairs
-    if covariance[0] <= 0.0:
+    is_straight = (bent > 0.0) & (bent < BENT)
+    if not is_straight.any():
         return 0
-    is_below = covariance < RADIAN * covariance[0]
-    return int(np.argmax(is_below)) if is_below.any() else longest
+    start = int(np.argmax(is_straight))
+    is_bent = ~is_straight[start:]
+    return start + 1 + int(np.argmax(is_bent)) if is_bent.any() else len(bent)

@@ -158,7 +158,7 @@ class Recording:
 
     @cached_property
     def motion_time(self) -> float:
-        """Time in s in which the motion goes through one radian; see :func:`motion_time`."""
+        """Time in s after which the motion is no straight line; see :func:`motion_time`."""
         return motion_time(self.usable_readings, self.time_step)
 
     @property
