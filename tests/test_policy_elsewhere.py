@@ -64,7 +64,7 @@ def test_a_policy_trained_on_exported_draws_works_better_on_the_hidden_rig(examp
     folder = tmp_path / "elsewhere"
     effects = "hinge_torque.coulomb_friction,motor.input_delay"
     wrapper = example.identify(folder, "--candidates", effects, num_steps=200)
-    reached = example.compare(folder, wrapper)
+    reached = example.compare(folder, wrapper, iterations=8, candidates=12, num_steps=200)
     print(reached)
     none, file, exported = reached.values()
     assert exported[0] > 0.1 * none[0]
