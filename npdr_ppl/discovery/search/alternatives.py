@@ -35,6 +35,7 @@ __all__ = [
     "probabilities",
     "tried_before",
     "weigh_alternatives",
+    "with_simple_forms",
 ]
 
 STRAIN = 0.02
@@ -149,6 +150,39 @@ def tried_before(
             others = {name: trial for name, trial in tried.items() if name != effect.name}
             return Alternatives(hypothesis, tried[effect.name], others)
     return None
+
+
+def with_simple_forms(effect: Effect, alternatives: Alternatives, trials: Trials) -> Alternatives:
+    """Fits simple laws once more, from where a law that contains them fits better.
+
+    Without the effects, the parameters may be far from where they are with one of them, and the
+    fits of two laws may end in different places. A law that contains another one then seems better
+    only because of its place.
+
+    Args:
+        effect: The effect.
+        alternatives: Its alternatives.
+        trials: Fits the model.
+    """
+    models = {effect.name: alternatives.with_it} | alternatives.others
+    scale = closest(list(models.values())).fit.scale
+    losses = {name: float(model.losses(scale).sum()) for name, model in models.items()}
+    best = min(losses, key=lambda name: losses[name])
+    law = next(e for e in models[best].effects if e.name == best)
+    worse = [
+        (name, next(e for e in model.effects if e.name == name))
+        for name, model in models.items()
+        if models[best].share * (losses[name] - losses[best]) > EVIDENCE.indistinct_loss
+    ]
+    asked = [(n, e) for n, e in worse if e.port == law.port and e.id in law.contains]
+    if not asked:
+        return alternatives
+    others = tuple(e for e in models[best].effects if e.name != best)
+    fitted = trials.each_refitted(models[best], [(*others, e) for _, e in asked])
+    for (name, _), found in zip(asked, fitted, strict=True):
+        if found is not None and float(found.losses(scale).sum()) < losses[name]:
+            models[name] = found
+    return Alternatives(alternatives.without, models.pop(effect.name), models)
 
 
 def weigh_alternatives(

@@ -12,6 +12,7 @@ from npdr_ppl.discovery.search.alternatives import (
     find_alternatives,
     tried_before,
     weigh_alternatives,
+    with_simple_forms,
 )
 from npdr_ppl.discovery.search.rounds import Round
 from npdr_ppl.discovery.search.trials import Trials
@@ -60,6 +61,8 @@ def with_rivals(
         of_each = _alternatives(asked, waiting, rounds, trials, options, stops)
         for effect, (alternatives, is_tried) in zip(waiting, of_each, strict=True):
             waiting = waiting[1:]
+            if alternatives is not None:
+                alternatives = with_simple_forms(effect, alternatives, trials)
             current, found = weigh_alternatives(
                 rounds[0].hypothesis,
                 asked,
