@@ -133,7 +133,7 @@ def discover(
     """
     from npdr_ppl.cli.effect_words import named_effects
     from npdr_ppl.cli.resolve import resolve_effects, resolve_holdout, resolve_model
-    from npdr_ppl.cli.show import show_discovery
+    from npdr_ppl.cli.show_discovery import show_discovery
     from npdr_ppl.discovery import DiscoveryOptions, Investigation
     from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until
     from npdr_ppl.display.plots.discovery_figures import (

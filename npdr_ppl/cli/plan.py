@@ -63,7 +63,7 @@ def plan(
     Example: npdr plan discovery furuta --limits limits.toml --out trajectory.csv
     """
     from npdr_ppl.cli.resolve import resolve_effects, resolve_model
-    from npdr_ppl.cli.show import show_plan
+    from npdr_ppl.cli.show_plan import show_plan
     from npdr_ppl.planning.causes import causes_of_prior, causes_of_run
     from npdr_ppl.planning.limits import default_limits, read_limits
     from npdr_ppl.planning.plan import plan_recording

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from npdr_ppl.cli import discover, show
+from npdr_ppl.cli import discover, show_discovery
 from npdr_ppl.cli.resolve import resolve_holdout, resolve_model
 from npdr_ppl.discovery import DiscoveryOptions, Investigation, kept_fits
 from npdr_ppl.run_files import save_tensors
@@ -247,7 +247,9 @@ def test_held_out_rollouts_come_from_the_same_file_or_another(recording, tmp_pat
 
 def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, tmp_path):
     text = StringIO()
-    monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))
+    monkeypatch.setattr(
+        show_discovery, "console_for_tables", lambda: Console(file=text, width=100)
+    )
     found = {
         "data_problems": [], "verdict": "ambiguous", "reason": "It cannot tell.", "effects": [],
         "gap": {}, "remainder": {"fired": True, "unexplained": 0.05},
@@ -257,7 +259,7 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
             "amplitude": {"torque": 4.0}, "separated_by": "a change of load",
         },
     }  # fmt: skip
-    show.show_discovery(found, tmp_path)
+    show_discovery.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "ambiguous: It cannot tell." in shown
     assert "slow ramp with torque up to 4, which separates the alternatives by 12" in shown
@@ -268,7 +270,9 @@ def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, t
 
 def test_a_learned_law_is_printed_with_its_checks(monkeypatch, tmp_path):
     text = StringIO()
-    monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))
+    monkeypatch.setattr(
+        show_discovery, "console_for_tables", lambda: Console(file=text, width=100)
+    )
     law = {"port": "hinge", "with_numbers": "− 0.02 v³", "unit": "N m"}
     found = {
         "data_problems": [], "verdict": "learned", "reason": "Learned.", "effects": [], "gap": {},
@@ -279,7 +283,7 @@ def test_a_learned_law_is_printed_with_its_checks(monkeypatch, tmp_path):
             "checks": [{"where": "the first half", "before": 12.5, "after": 1.25}],
         },
     }  # fmt: skip
-    show.show_discovery(found, tmp_path)
+    show_discovery.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "hinge − 0.02 v³ N m" in shown and "the first half 12.5 1.25" in shown
     assert "Explained misfit lost at hinge without v 100%." in shown
@@ -288,7 +292,9 @@ def test_a_learned_law_is_printed_with_its_checks(monkeypatch, tmp_path):
 
 def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     text = StringIO()
-    monkeypatch.setattr(show, "_console", lambda: Console(file=text, width=100))
+    monkeypatch.setattr(
+        show_discovery, "console_for_tables", lambda: Console(file=text, width=100)
+    )
     strength = {"mean": 0.1, "sd": 0.01, "hdi_94": [0.08, 0.12], "unit": "N m"}
     found = {
         "data_problems": [], "verdict": "named", "reason": "Missing: hinge.bias.", "gap": {},
@@ -300,7 +306,7 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
         ],
         "remainder": {"fired": False, "unexplained": 0.0}, "counts": {}, "next_experiment": None,
     }  # fmt: skip
-    show.show_discovery(found, tmp_path)
+    show_discovery.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "Too small to be named, but in the model: hinge.wind." in shown
     assert "hinge.wind was not found in the first half of the recording." in shown
@@ -309,7 +315,7 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     found["effects"][0]["probability"] = None  # a time limit ended the search
     # JSON has no infinite mean.
     found["effects"][0]["parameters"] = {"size": {**strength, "mean": None, "sd": None}}
-    show.show_discovery(found, tmp_path)
+    show_discovery.show_discovery(found, tmp_path)
     assert "Not compared with alternatives: hinge.bias." in " ".join(text.getvalue().split())
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from npdr_ppl.cli.show import show_plan
+from npdr_ppl.cli.show_plan import show_plan
 
 OUTLOOK = {
     "chance_of_the_right_name": 0.62,
