@@ -8,12 +8,13 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.compilation import (
     compiled,
     mark_sizes_dynamic,
     signature,
 )
-from npdr_ppl.engines.common.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.common.effect_chain import EffectChain
 from npdr_ppl.engines.common.episodes import Episodes, FeedbackPolicy, Reward
 from npdr_ppl.engines.common.integrators import Components
 

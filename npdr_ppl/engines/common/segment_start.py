@@ -6,8 +6,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, commands_at
-from npdr_ppl.engines.common.effect_chain import EffectChain, State, Tables
+from npdr_ppl.engines.common.effect_chain import EffectChain
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.common.measurement_times import catch_up, sensor_leads
 from npdr_ppl.language.inputs import Inputs
@@ -83,12 +84,12 @@ def true_start(
         recorded: The recorded data at the start.
         records: Commands of each action channel.
     """
-    if not chain.sensor_effects:
+    if not chain.sensors.effects:
         return recorded.states
     states = chain.simulator.states
     sensors = {sensor.name: i for i, sensor in enumerate(chain.simulator.sensors)}
     true = list(recorded.states)
-    for place, effect, columns in chain.sensor_effects:
+    for place, effect, columns in chain.sensors.effects:
         for i, state in enumerate(states):
             value = true[i]
             if sensors.get(state.name) in columns:
@@ -101,7 +102,7 @@ def true_start(
                 # Simulator.initial_states.
                 value = torch.where(recorded.time == 0.0, value, rate)
             true[i] = value
-    leads = sensor_leads(chain.sensor_effects, tables.effects, recorded.time)
+    leads = sensor_leads(chain.sensors.effects, tables.effects, recorded.time)
     if not leads:
         return tuple(true)
     sources = (
@@ -134,8 +135,8 @@ def with_past_commands(
         records: Commands of each action channel.
         num_steps: Number of past steps that were recorded.
     """
-    if chain.action_effects:
+    if chain.actions.effects:
         for step in range(-num_steps, 0):
             views = tuple(record.view(step) for record in records)
-            state, _, _ = chain.act(state, commands_at(records, step), tables, views)
+            state, _, _ = chain.actions.act(state, commands_at(records, step), tables, views)
     return state

@@ -12,14 +12,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.chain_state import Moments, State, Tables
 from npdr_ppl.engines.common.commands import command_records, commands_at
-from npdr_ppl.engines.common.effect_chain import (
-    EffectChain,
-    Moments,
-    State,
-    Tables,
-    needed_histories,
-)
+from npdr_ppl.engines.common.effect_chain import EffectChain, needed_histories
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.language.effects import ActionEffect, SensorEffect
@@ -86,13 +81,13 @@ class Signals:
         # All commands are known before the engine runs, and measurements only afterwards.
         self._action_chain, self._action_parameters = chain(ActionEffect)
         self._sensor_chain, self._sensor_parameters = chain(SensorEffect)
-        kept = self._action_chain.num_kept_steps(inputs.past_actions.shape[-2])
+        kept = self._action_chain.actions.num_kept_steps(inputs.past_actions.shape[-2])
         self._records = command_records(simulator, inputs, shape, torch.float64, kept)
 
     @property
     def has_action_effects(self) -> bool:
         """Whether actions for the engine may differ between simulations of the same segment."""
-        return bool(self._action_chain.action_effects)
+        return bool(self._action_chain.actions.effects)
 
     def initial_states(self) -> Tensor:
         """Returns the true state at each segment's start, ``(N, states)``.
@@ -111,7 +106,7 @@ class Signals:
             shape = len(self.start_times), self._inputs.num_steps, 0
             return torch.zeros(shape, dtype=torch.float64)
         chain, tables = self._action_chain, Tables(None, self._action_parameters)
-        past = chain.num_past_steps(self._inputs.past_actions.shape[-2])
+        past = chain.actions.num_past_steps(self._inputs.past_actions.shape[-2])
         settled = commands_at(self._records, -1 - past)
         state = chain.start((), (), tables, settled, (), self.start_times, num_past=past)
         state = with_past_commands(chain, state, tables, self._records, past)
@@ -119,7 +114,7 @@ class Signals:
         for step in range(self._inputs.num_steps):
             commands = commands_at(self._records, step)
             views = tuple(record.view(step) for record in self._records)
-            state, reached, _ = chain.act(state, commands, tables, views)
+            state, reached, _ = chain.actions.act(state, commands, tables, views)
             steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))
         return torch.stack(steps, dim=-2)
 
@@ -131,13 +126,13 @@ class Signals:
             initial_states: True states at the start, ``(N, states)``.
         """
         chain, effects = self._sensor_chain, self._sensor_parameters
-        if not chain.sensor_effects:
+        if not chain.sensors.effects:
             return values
         tables = Tables(self._true_at_start(values, initial_states), effects)
         state = chain.start((), (), tables, (), self._recorded.readings, self.start_times)
         steps = []
         for present in values.unbind(-2):
-            state, read = chain.report(state, present.unbind(-1), tables)
+            state, read = chain.sensors.report(state, present.unbind(-1), tables)
             steps.append(torch.stack(read, dim=-1))
         return torch.stack(steps, dim=-2)
 

@@ -5,8 +5,9 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.chain_state import Moments, State, Tables
 from npdr_ppl.engines.common.dry_friction import dry_friction_over_step
-from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
+from npdr_ppl.engines.common.effect_chain import EffectChain
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.language.effect_context import Joint
 from npdr_ppl.language.simulator import Simulator
@@ -84,18 +85,20 @@ class ForcedMotion(EffectChain):
     ) -> tuple[Tensor, State]:
         q, v = self._joints_of(states)
         memory = memory._replace(positions=q, velocities=v)
-        if self.needs_joints:
-            memory = self.begin_step(memory, self._joints(states, memory, action, tables), tables)
-        forces = self.applied_forces(q, v, memory, tables)
+        if self.forces.needs_joints:
+            memory = self.forces.begin_step(
+                memory, self._joints(states, memory, action, tables), tables
+            )
+        forces = self.forces.smooth_forces(q, v, memory, tables)
         end = self._end(states, action, forces)
         if any(force is not None for force in forces):
             middle = self._joints_of(0.5 * (states + end))
-            forces = self.applied_forces(*middle, memory, tables)
+            forces = self.forces.smooth_forces(*middle, memory, tables)
             end = self._end(states, action, forces)
-        bounds = self.dry_friction_bounds(memory, tables)
+        bounds = self.forces.dry_friction_bounds(memory, tables)
         if any(bound is not None for bound in bounds):
             end = self._with_dry_friction(states, end, memory, action, forces, bounds, tables)
-        return end, memory._replace(force_memory=self.next_force_memory(memory, tables))
+        return end, memory._replace(force_memory=self.forces.next_memory(memory, tables))
 
     def _with_dry_friction(
         self,
@@ -110,7 +113,7 @@ class ForcedMotion(EffectChain):
         """Returns the states after a step with dry friction; ``end`` is without it."""
 
         def bounds_at(velocities: Components) -> Forces:
-            return self.dry_friction_bounds(memory._replace(velocities=velocities), tables)
+            return self.forces.dry_friction_bounds(memory._replace(velocities=velocities), tables)
 
         free = self._accelerations(states, end)
         inertia = self._inverse_inertia(states, action, forces, free)
@@ -134,7 +137,7 @@ class ForcedMotion(EffectChain):
     ) -> tuple[Joint, ...]:
         """Returns the joints before the forces of the effects that need them are applied."""
         q, v = memory.positions, memory.velocities
-        forces = self.applied_forces(q, v, memory, tables, before_step=True)
+        forces = self.forces.smooth_forces(q, v, memory, tables, before_step=True)
         accelerations = self._accelerations(states, self._end(states, action, forces))
         inertia = self._inverse_inertia(states, action, forces, accelerations)
         still = self._accelerations(states, self._end(states, torch.zeros_like(action), forces))

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.chain_state import Tables
 from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
-from npdr_ppl.engines.common.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.common.effect_chain import needed_histories
 from npdr_ppl.engines.common.robot_files import located
 from npdr_ppl.engines.common.source_files import recorded_mjcf
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf

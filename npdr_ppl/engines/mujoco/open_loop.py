@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, command_records, commands_at
-from npdr_ppl.engines.common.effect_chain import State, Tables
 from npdr_ppl.engines.common.past_motion import PastMotion, past_motion
 from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
 from npdr_ppl.engines.mujoco.batches import quiet
@@ -119,7 +119,7 @@ class _Replay:
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
             records = self._records(chain, first, last)
             components = true_start(chain, tables, recorded, records)
-            past = chain.num_past_steps(self.inputs.past_actions.shape[-2])
+            past = chain.actions.num_past_steps(self.inputs.past_actions.shape[-2])
             chain.place(components)
             chain.begin()
             state = chain.start(
@@ -147,12 +147,12 @@ class _Replay:
                 return self._step_by_step(chain, state, tables, controls)
             true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)
         readings = torch.from_numpy(true)
-        if not chain.sensor_effects:
+        if not chain.sensors.effects:
             return readings
         # Written to a separate table, because effects keep references to true values.
         reported = torch.empty_like(readings)
         for k in range(self.inputs.num_steps):
-            state, values = chain.report(state, readings[:, k].unbind(-1), tables)
+            state, values = chain.sensors.report(state, readings[:, k].unbind(-1), tables)
             reported[:, k] = torch.stack(values, dim=-1)
         return reported
 
@@ -170,9 +170,9 @@ class _Replay:
 
     def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
         """Returns the commands of each action channel, if an effect needs them."""
-        if not (chain.action_effects or chain.sensor_effects):
+        if not (chain.actions.effects or chain.sensors.effects):
             return ()
-        kept = chain.num_kept_steps(self.inputs.past_actions.shape[-2])
+        kept = chain.actions.num_kept_steps(self.inputs.past_actions.shape[-2])
         records = command_records(self.simulator, self.inputs, self.shape, torch.float64, kept)
         return tuple(record.part(first, last) for record in records)
 
@@ -195,16 +195,16 @@ class _Replay:
         Without action effects, the third axis has size 1.
         """
         controls = self.commands[self.rows[first:last], :, None]
-        if not chain.action_effects:
+        if not chain.actions.effects:
             return controls
         controls = np.repeat(controls, chain.substeps, axis=2)
-        past = chain.num_past_steps(self.inputs.past_actions.shape[-2])
+        past = chain.actions.num_past_steps(self.inputs.past_actions.shape[-2])
         state = with_past_commands(chain, state, tables, records, past)
         for k in range(self.inputs.num_steps):
             commands = commands_at(records, k)
             views = tuple(record.view(k) for record in records)
-            state, actions, moments = chain.act(state, commands, tables, views)
-            means, _ = chain.by_substep(actions, moments, chain.substeps)
+            state, actions, moments = chain.actions.act(state, commands, tables, views)
+            means, _ = chain.actions.by_substep(actions, moments, chain.substeps)
             for part, present in enumerate(means):
                 for channel, action in enumerate(present):
                     controls[:, k, part, channel] = action.numpy()

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.common.effect_chain import Tables
+from npdr_ppl.engines.common.chain_state import Tables
 from npdr_ppl.engines.mujoco.fields import actuated_joint
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.language.inputs import Inputs

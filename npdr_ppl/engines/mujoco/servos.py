@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.common.effect_chain import Tables
+from npdr_ppl.engines.common.chain_state import Tables
 from npdr_ppl.engines.mujoco.fields import actuated_joint, servo_gains
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.errors import ModelError

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
+from npdr_ppl.engines.common.chain_state import Moments, State, Tables
+from npdr_ppl.engines.common.effect_chain import EffectChain
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
@@ -50,13 +51,15 @@ class MujocoStepper(EffectChain):
         time_step: float,
         histories: tuple[int, ...],
     ) -> None:
-        super().__init__(simulator, simulator.joints, time_step, histories)
-        self.simulator: MujocoMechanism = simulator
-        self.force_effects = [f for f in self.force_effects if not simulator.is_native(f[1])]
-        servo_effects = simulator.servo_effects
-        self.has_forces = bool(servo_effects or self.force_effects)
         self.substeps = simulator.num_substeps(time_step)
         self._engine_step = time_step / self.substeps
+        super().__init__(
+            simulator, simulator.joints, time_step, histories, force_step=self._engine_step
+        )
+        self.simulator: MujocoMechanism = simulator
+        self.forces.effects = [f for f in self.forces.effects if not simulator.is_native(f[1])]
+        servo_effects = simulator.servo_effects
+        self.has_forces = bool(servo_effects or self.forces.effects)
         self._batch = batch
         self._module: Any = importlib.import_module("mujoco.batch")
         self._qpos, self._qvel = state_view(batch, "qpos"), state_view(batch, "qvel")
@@ -67,17 +70,14 @@ class MujocoStepper(EffectChain):
         # computed again. Acceleration sensors report the values of the last engine step.
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
-        self._applied = state_view(batch, "qfrc_applied") if self.force_effects else None
+        self._applied = state_view(batch, "qfrc_applied") if self.forces.effects else None
         self._servos = ServoErrors(simulator.model, servo_effects, self._ctrl, self._qpos)
         # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
-        self._joints = JointStates(batch, simulator.force_ports) if self.needs_joints else None
+        self._joints = (
+            JointStates(batch, simulator.force_ports) if self.forces.needs_joints else None
+        )
         self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
-
-    @property
-    def force_step(self) -> float:
-        """Seconds per engine step."""
-        return self._engine_step
 
     @property
     def num_positions(self) -> int:
@@ -165,7 +165,9 @@ class MujocoStepper(EffectChain):
         """Advances all simulations by one control step; see :meth:`EffectChain.move`."""
         if not any(moment is not None for moment in moments):
             return self.follow(state, [actions], tables)
-        return self.follow(state, self.by_substep(actions, moments, self.substeps)[0], tables)
+        return self.follow(
+            state, self.actions.by_substep(actions, moments, self.substeps)[0], tables
+        )
 
     def follow(self, state: State, actions: Sequence[Components], tables: Tables) -> State:
         """Advances all simulations by one control step.
@@ -190,7 +192,7 @@ class MujocoStepper(EffectChain):
         """Advances all simulations by one engine step under the force effects."""
         servo_memory = self._servos.apply(tables, state.servo_memory, self._engine_step)
         state = state._replace(servo_memory=servo_memory)
-        if not self.force_effects:
+        if not self.forces.effects:
             self._guarded(self._batch.step, stage=stage)
             return state
         positions, velocities = self.at_joints((), ())
@@ -198,20 +200,20 @@ class MujocoStepper(EffectChain):
         if self._joints is not None:
             self._apply(state, tables, before_step=True)
             self._look(ACCELERATION_STAGE)
-            state = self.begin_step(state, self._joints.read(positions, velocities), tables)
+            state = self.forces.begin_step(state, self._joints.read(positions, velocities), tables)
         self._apply(state, tables)
-        memory = self.next_force_memory(state, tables)
+        memory = self.forces.next_memory(state, tables)
         self._guarded(self._batch.step, stage=stage)
         return state._replace(force_memory=memory)
 
     def _apply(self, state: State, tables: Tables, *, before_step: bool = False) -> None:
-        """Passes the effects' forces to the engine; see :meth:`applied_forces`.
+        """Passes the effects' forces to the engine; see :meth:`ForceEffects.smooth_forces`.
 
         With ``before_step``, their dry friction is left out.
         """
         assert self._applied is not None
         ports = self.simulator.force_ports
-        forces = self.applied_forces(
+        forces = self.forces.smooth_forces(
             state.positions, state.velocities, state, tables, before_step=before_step
         )
         if before_step:
@@ -225,7 +227,7 @@ class MujocoStepper(EffectChain):
                 present, own = self._friction
                 present[:] = own
             return
-        for port, bound in zip(ports, self.dry_friction_bounds(state, tables), strict=True):
+        for port, bound in zip(ports, self.forces.dry_friction_bounds(state, tables), strict=True):
             if bound is not None:
                 if self._friction is None:
                     bounds = self._batch.expand("dof_frictionloss")

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.chain_state import Tables
 from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.common.compilation import CompileMode
-from npdr_ppl.engines.common.effect_chain import Tables, needed_histories
+from npdr_ppl.engines.common.effect_chain import needed_histories
 from npdr_ppl.engines.common.integrators import Components, Integrator, integrator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect, EnvironmentEffect

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import (
     CommandRecord,
     RecordedCommands,
@@ -21,7 +22,6 @@ from npdr_ppl.engines.common.compilation import (
     steps_per_call,
     with_fallback,
 )
-from npdr_ppl.engines.common.effect_chain import State, Tables
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.common.past_motion import past_motion
 from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
@@ -75,7 +75,7 @@ def _replay(
     """Returns all trajectories, ``shape + (steps, sensors)``, including padded steps."""
     tables, histories = simulator.tables(domain, shape, inputs.time_step, expand=is_compiled)
     body = _Body(Stepper(simulator, inputs.time_step, histories))
-    kept = body.stepper.num_kept_steps(inputs.past_actions.shape[-2])
+    kept = body.stepper.actions.num_kept_steps(inputs.past_actions.shape[-2])
     records = command_records(simulator, inputs, shape, dtype, kept)
     readings: list[Tensor] = []
     given = tables, [vars(part) for part in (inputs, *records)]
@@ -177,7 +177,7 @@ def _run_compiled(
         views = tuple(
             (table, rows, torch.as_tensor(time), torch.as_tensor(stride))
             for table, rows, time, stride in _views(records, step)
-            if body.stepper.action_effects
+            if body.stepper.actions.effects
         )
         mark_sizes_dynamic((state, tables, commands, views))
         state, values = run(state, tables, commands, views)
@@ -202,7 +202,7 @@ def _start(
             f"{simulator.name} has {num_joints} joints, so it should declare {2 * num_joints} "
             f"states, got {len(recorded.states)}."
         )
-    past = stepper.num_past_steps(inputs.past_actions.shape[-2])
+    past = stepper.actions.num_past_steps(inputs.past_actions.shape[-2])
     components = true_start(stepper, tables, recorded, records)
     state = stepper.start(
         components[:num_joints],

@@ -5,12 +5,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.chain_state import Moments, State, Tables
 from npdr_ppl.engines.common.dry_friction import (
     DryFriction,
     dry_friction_over_step,
     stopping_friction,
 )
-from npdr_ppl.engines.common.effect_chain import EffectChain, Moments, State, Tables
+from npdr_ppl.engines.common.effect_chain import EffectChain
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.ode.mechanical_system import MechanicalSystem
 from npdr_ppl.language.effect_context import Joint
@@ -31,16 +32,12 @@ class Stepper(EffectChain):
     def __init__(
         self, simulator: MechanicalSystem, time_step: float, histories: tuple[int, ...]
     ) -> None:
-        super().__init__(simulator, simulator.joints, time_step, histories)
+        substep = time_step / simulator.substeps
+        super().__init__(simulator, simulator.joints, time_step, histories, force_step=substep)
         self.simulator: MechanicalSystem = simulator
-        self._substep = time_step / simulator.substeps
+        self._substep = substep
         # With a first-order integrator, moments would not make the positions more accurate.
         self._takes_moments = simulator.integrator.order > 1
-
-    @property
-    def force_step(self) -> float:
-        """Seconds per integration step."""
-        return self._substep
 
     def true_readings(
         self, positions: Components, velocities: Components, tables: Tables
@@ -59,7 +56,7 @@ class Stepper(EffectChain):
         self, state: State, actions: Components, tables: Tables, moments: Moments = ()
     ) -> State:
         """Advances the dynamics by one time step; see :meth:`EffectChain.move`."""
-        means, left = self.by_substep(actions, moments, self.simulator.substeps)
+        means, left = self.actions.by_substep(actions, moments, self.simulator.substeps)
         for present in means:
             state = self._move_once(state, present, left, tables)
         return state
@@ -68,8 +65,8 @@ class Stepper(EffectChain):
         self, state: State, actions: Components, moments: Moments, tables: Tables
     ) -> State:
         """Advances the dynamics by one substep."""
-        if self.needs_joints:
-            state = self.begin_step(state, self._joints(state, actions, tables), tables)
+        if self.forces.needs_joints:
+            state = self.forces.begin_step(state, self._joints(state, actions, tables), tables)
         simulator, constants = self.simulator, tables.constants
         start = state.positions, state.velocities
         dry: tuple[Any, ...] = (0.0,) * len(state.positions)
@@ -80,7 +77,7 @@ class Stepper(EffectChain):
 
         forces = self._forces(*start, state, tables, dry)
         first = even = simulator.accelerations(*start, actions, forces, constants)
-        within = self.force_moments(state, tables)
+        within = self.forces.moments(state, tables)
         is_uneven = any(moment is not None for moment in (*moments, *within))
         shifts: Components | None = None
         if self._takes_moments and is_uneven:
@@ -91,9 +88,9 @@ class Stepper(EffectChain):
             shifts = tuple(a - b for a, b in zip(even, late, strict=True))
 
         def bounds_at(velocities: Components) -> tuple[Tensor | None, ...]:
-            return self.dry_friction_bounds(state._replace(velocities=velocities), tables)
+            return self.forces.dry_friction_bounds(state._replace(velocities=velocities), tables)
 
-        bounds = self.dry_friction_bounds(state, tables)
+        bounds = self.forces.dry_friction_bounds(state, tables)
         friction: DryFriction | None = None
         if any(bound is not None for bound in bounds):
             inertia = _inverse_inertia(simulator, *start, actions, forces, constants, first)
@@ -133,7 +130,7 @@ class Stepper(EffectChain):
                 qi if shortfall is None else qi + shortfall
                 for qi, shortfall in zip(q, friction.shortfalls, strict=True)
             )
-        memory = self.next_force_memory(state, tables)
+        memory = self.forces.next_memory(state, tables)
         return state._replace(positions=q, velocities=v, force_memory=memory)
 
     def _joints(self, state: State, actions: Components, tables: Tables) -> tuple[Joint, ...]:
@@ -160,9 +157,11 @@ class Stepper(EffectChain):
         before_step: bool = False,
     ) -> tuple[Any, ...]:
         """Returns the sum of smooth forces in a state of the integrator and dry friction."""
-        if not self.force_effects:
+        if not self.forces.effects:
             return dry
-        smooth = self.applied_forces(positions, velocities, state, tables, before_step=before_step)
+        smooth = self.forces.smooth_forces(
+            positions, velocities, state, tables, before_step=before_step
+        )
         # Without dry friction, d is the number zero, and adding it would be an operation more.
         return tuple(
             d if f is None else (d + f if isinstance(d, Tensor) else f)

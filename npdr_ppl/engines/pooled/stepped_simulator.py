@@ -11,14 +11,9 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.engines.common.batching import flatten
+from npdr_ppl.engines.common.chain_state import Moments, State, Tables
 from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
-from npdr_ppl.engines.common.effect_chain import (
-    EffectChain,
-    Moments,
-    State,
-    Tables,
-    needed_histories,
-)
+from npdr_ppl.engines.common.effect_chain import EffectChain, needed_histories
 from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.common.policy_loop import LoopBody, begin
