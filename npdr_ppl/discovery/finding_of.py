@@ -1,18 +1,47 @@
-"""What a discovery says about an effect that its search added."""
+"""What a discovery says about the effects that its search added."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
 from npdr_ppl.discovery.screening.equivalents import equivalents
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.parts import PartResult
-from npdr_ppl.discovery.search.repeatability import Repetition
+from npdr_ppl.discovery.search.repeatability import Repetition, repetitions
 from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.settings import VERDICT
 
-__all__ = ["finding_of"]
+__all__ = ["finding_of", "findings_of"]
+
+
+def findings_of(
+    search: Search,
+    every: dict[str, Estimate],
+    at_edge: Sequence[tuple[str, ...]],
+    found_in: Mapping[str, Sequence[PartResult]],
+) -> list[Finding]:
+    """Returns what a discovery says about all effects; the one that explains most comes first.
+
+    Args:
+        search: The search.
+        every: Estimates of all parameters, by site.
+        at_edge: For each effect that it added, the shape parameters with an implausible value.
+        found_in: Whether parts of the recording show an effect, by its name.
+    """
+    again = repetitions(search.final)
+    effects = [
+        finding_of(
+            added,
+            search,
+            every,
+            implausible,
+            again.get(added.effect.name),
+            found_in.get(added.effect.name, []),
+        )
+        for added, implausible in zip(search.added, at_edge, strict=True)
+    ]
+    return sorted(effects, key=lambda found: found.share, reverse=True)
 
 
 def finding_of(

@@ -1,29 +1,21 @@
 """Discovery: finds which effect a model lacks, adds it and measures whether that helps."""
 
 import math
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping
 from functools import cached_property
 
 from torch.distributions import Distribution
 
+from npdr_ppl.discovery.conclusion import Conclusion, conclusion_of, with_law
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery
-from npdr_ppl.discovery.finding_of import finding_of
+from npdr_ppl.discovery.finding_of import findings_of
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.result import Learned, learn
-from npdr_ppl.discovery.proof.estimated_anew import EstimatedAnew, estimated_anew
-from npdr_ppl.discovery.proof.held_out_gap import Gap, prove
-from npdr_ppl.discovery.proof.next_experiment import NextExperiment, next_experiment
-from npdr_ppl.discovery.proof.overlays import Overlays, overlay
-from npdr_ppl.discovery.proof.parameter_intervals import (
-    Draws,
-    estimates,
-    posterior_draws,
-)
+from npdr_ppl.discovery.predictions import Predictions, held_out_options
+from npdr_ppl.discovery.proof.held_out_gap import Gap
+from npdr_ppl.discovery.proof.next_experiment import experiment_for
 from npdr_ppl.discovery.proof.residual_map import Spot, worst_windows
 from npdr_ppl.discovery.proof.surviving_causes import surviving_causes
 from npdr_ppl.discovery.recording_repair import Repair, repair
@@ -34,13 +26,11 @@ from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.limits import limits
 from npdr_ppl.discovery.search.parts import PartResult, found_in_parts
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
-from npdr_ppl.discovery.search.repeatability import repetitions
-from npdr_ppl.discovery.search.rounds import Round, Search, explained
-from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH
+from npdr_ppl.discovery.search.rounds import Round, Search
+from npdr_ppl.discovery.search.settings import SEARCH
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.discovery.settings import VERDICT
-from npdr_ppl.discovery.verdict import judge, most_doubtful
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -107,24 +97,14 @@ class Investigation:
         self._recorded_holdout = holdout
         self.settings = search or DiscoveryOptions()
         self.seed = seed
-        self.seconds: dict[str, float] = {}
         self.progress = SearchProgress(progress)
+        self.seconds = self.progress.seconds
         self._data_options = segment_options(rollouts, options)
         self._deadline = Deadline(self.settings.time_limit)
-        self._drawn: list[tuple[Hypothesis, Draws]] = []
-        self._anew: list[tuple[Hypothesis, EstimatedAnew | None]] = []
-
-    @contextmanager
-    def _stage(self, name: str) -> Iterator[None]:
-        """Shows progress inside the block, and records how long it takes."""
-        begin = time.monotonic()
-        with self.progress.shown():
-            yield
-        self.seconds[name] = time.monotonic() - begin
 
     @cached_property
     def _repair(self) -> Repair:
-        with self._stage("check data"):
+        with self.progress.timed("check data"):
             self.progress.say("checking the recording")
             found = repair(self.model, self.recorded, self._data_options, report=self.progress.say)
         simulator = found.simulator
@@ -177,7 +157,7 @@ class Investigation:
     def given(self) -> Hypothesis:
         """The original model, fitted to the recording."""
         searcher = self._searcher
-        with self._stage("fit"):
+        with self.progress.timed("fit"):
             step = self.progress.stage("fit the original model")
             fitted = searcher.fit_base(may_be_rough=True, progress=step)
         return fitted
@@ -191,7 +171,7 @@ class Investigation:
     def _start(self) -> tuple[Hypothesis, Mapping[str, Distribution]]:
         """The fit that the search begins with, and the model's original priors."""
         given = self.given
-        with self._stage("choose steps"):
+        with self.progress.timed("choose steps"):
             self.progress.say("checking integration steps and priors")
             priors = given.segments.prior.distributions
             return self._searcher.settled(given), priors
@@ -213,14 +193,14 @@ class Investigation:
     def first(self) -> Round:
         """Alarm and ranking before any effect is added."""
         start = self.start
-        with self._stage("screen"):
+        with self.progress.timed("screen"):
             return self._searcher.look(start)
 
     @cached_property
     def search(self) -> Search:
         """The missing effects."""
         first = self.first
-        with self._stage("search"):
+        with self.progress.timed("search"):
             return self._searcher.run(first, max_effects=self.settings.max_effects)
 
     @cached_property
@@ -229,7 +209,7 @@ class Investigation:
         is_asked = self.settings.repeat and self.search.added
         if not is_asked or self.search.has_stopped:
             return {}
-        with self._stage("search parts"):
+        with self.progress.timed("search parts"):
             step = self.progress.stage("seek the effects in parts of the recording")
             return found_in_parts(self.search, self.progress.say, step)
 
@@ -239,7 +219,7 @@ class Investigation:
         search = self.search
         final, explains = search.final, sum(added.share for added in search.added)
         result = []
-        with self._stage("limits"):
+        with self.progress.timed("limits"):
             for added in search.added:
                 names = list(final.at_edge(added.effect))
                 if added.share > VERDICT.minor_share * explains:
@@ -248,54 +228,22 @@ class Investigation:
                 result.append(tuple(dict.fromkeys(names)))
         return result
 
-    def _draws(self, hypothesis: Hypothesis) -> Draws:
-        """Returns draws of a hypothesis's posterior."""
-        for known, draws in self._drawn:
-            if known is hypothesis:
-                return draws
-        with self._stage(f"posterior {len(self._drawn) + 1}"):
-            self.progress.say("drawing parameters")
-            # The original model predicts; where it lacks effects, its intervals are wrong.
-            is_rough = hypothesis is self.given and bool(hypothesis is not self.search.final)
-            draws = posterior_draws(hypothesis, seed=self.seed, is_rough=is_rough)
-        self._drawn.append((hypothesis, draws))
-        return draws
+    @cached_property
+    def _predictions(self) -> Predictions:
+        return Predictions(
+            self.given,
+            self.search.final,
+            self.rollouts,
+            self.holdout,
+            self._data_options,
+            seed=self.seed,
+            progress=self.progress,
+        )
 
     @cached_property
     def gap(self) -> dict[str, Gap]:
         """Metrics on the held-out recording; empty without one."""
-        return self._gap_of(self.search.final)
-
-    def _gap_of(self, final: Hypothesis) -> dict[str, Gap]:
-        """Returns the metrics of a revised model on the held-out recording."""
-        if self.holdout is None:
-            return {}
-        given = self.given
-        draws_before, draws_after = self._draws(given), self._draws(final)
-        with self._stage("prove"):
-            self.progress.say("predicting the held-out recording")
-            data_options = _like(self._data_options, self.rollouts, self.holdout)
-            return prove(
-                given,
-                final,
-                self.holdout,
-                data_options,
-                draws_before=draws_before,
-                draws_after=draws_after,
-                seed=self.seed,
-                anew=self._anew_of(final),
-            )
-
-    def _anew_of(self, final: Hypothesis) -> EstimatedAnew | None:
-        """Returns what belongs to a recording in a revised model, as in the held-out recording."""
-        if self.holdout is None:
-            return None
-        for known, anew in self._anew:
-            if known is final:
-                return anew
-        data_options = _like(self._data_options, self.rollouts, self.holdout)
-        self._anew.append((final, estimated_anew(final, self.holdout, data_options)))
-        return self._anew[-1][1]
+        return self._predictions.gap(self.search.final)
 
     @cached_property
     def learned(self) -> Learned | None:
@@ -306,9 +254,9 @@ class Investigation:
         """
         search, holdout, options = self.search, self.holdout, None
         if holdout is not None:
-            options = _like(self._data_options, self.rollouts, holdout)
+            options = held_out_options(self._data_options, self.rollouts, holdout)
         starts = [self.start, *([search.final] if search.added else [])]
-        with self._stage("learn"):
+        with self.progress.timed("learn"):
             return learn(
                 self._searcher.trials,
                 starts,
@@ -318,38 +266,6 @@ class Investigation:
                 assumptions=Assumptions(self.settings.symmetry, self.settings.is_passive),
                 report=self.progress.say,
             )
-
-    def _overlays(self, final: Hypothesis) -> Overlays:
-        """Returns the held-out rollouts, or else the recording, and simulations of them."""
-        shown = self.rollouts if self.holdout is None else self.holdout
-        with self._stage("simulate"):
-            self.progress.say("simulating the recording")
-            return overlay(
-                self.given,
-                final,
-                self.start,
-                shown,
-                self._data_options,
-                is_held_out=self.holdout is not None,
-                anew=self._anew_of(final),
-            )
-
-    def _advice(self, name: str) -> NextExperiment | None:
-        """Returns the experiment that would separate the likeliest alternatives to an effect."""
-        search = self.search
-        added = next(a for a in search.added if a.effect.name == name)
-        likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
-        names = [
-            n
-            for n in likeliest[: VERDICT.most_separated]
-            if added.alternatives[n] >= EVIDENCE.least_probability
-        ]
-        alternatives = [search.trials[added.place, n] for n in names]
-        if len(alternatives) < 2:
-            return None
-        ids = {name.rsplit(".", 1)[1] for name in names}
-        classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
-        return next_experiment(alternatives, self.rollouts, self._data_options, classes)
 
     @property
     def preparation(self) -> PreparationSummary:
@@ -366,64 +282,34 @@ class Investigation:
             tuple(map(str, self.narrow_priors)),
         )
 
+    def _conclusion(self) -> Conclusion:
+        """Returns what follows from the search, and from a learned law if one is needed."""
+        search, found_in, predictions = self.search, self.found_in, self._predictions
+        parameters = predictions.parameters(search.final)
+        effects = findings_of(search, parameters, self._at_edge, found_in)
+        found = conclusion_of(search, effects, parameters, self.gap, self.settings)
+        needs_law = found.verdict == "unknown" and not search.has_stopped
+        if not (self.settings.learn and needs_law) or self.learned is None:
+            return found
+        return with_law(found, self.learned, predictions, self._searcher.look)
+
     def conclude(self) -> Discovery:
         """Runs all stages and returns the result."""
-        search, found_in = self.search, self.found_in
-        final = search.final
-        unexplained = _unexplained(search)
-        every = estimates(final, self._draws(final), _units(final))
-        again = repetitions(final)
-        effects = [
-            finding_of(
-                added,
-                search,
-                every,
-                at_edge,
-                again.get(added.effect.name),
-                found_in.get(added.effect.name, []),
-            )
-            for added, at_edge in zip(search.added, self._at_edge, strict=True)
-        ]
-        effects.sort(key=lambda found: found.share, reverse=True)
-        gap = self.gap
-        verdict, reason = judge(search, effects, unexplained, gap, self.settings)
-        learned: Learned | None = None
-        if self.settings.learn and verdict == "unknown" and not search.has_stopped:
-            learned = self.learned
-        if learned is not None and learned.is_offered:
-            proven = self._gap_of(learned.model.hypothesis)
-            if proven and proven["rmse"].has_grown:
-                learned = learned.withdrawn(
-                    f"{learned.reason} But the error on the held-out rollouts grows from "
-                    f"{proven['rmse'].before:.3g} to {proven['rmse'].after:.3g}."
-                )
-            else:
-                verdict, gap = "learned", proven
-                left = self._searcher.look(learned.model.hypothesis)
-                search = replace(
-                    search, rounds=[*search.rounds, left], final=learned.model.hypothesis
-                )
-                unexplained = _unexplained(search)
-                final = learned.model.hypothesis
-                reason = f"No effect that was searched explains the recording. {learned.reason}"
-                every = estimates(final, self._draws(final), _units(final))
-                kept = {effect.name for effect in learned.model.start.effects}
-                effects = [found for found in effects if found.effect.name in kept]
+        found, predictions = self._conclusion(), self._predictions
+        search, final = found.search, found.search.final
+        reason = found.reason
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
-        with self._stage("next experiment"):
-            advice, doubtful = None, None
-            if verdict == "ambiguous":
-                doubtful = most_doubtful(effects, self.settings).effect.name
-                advice = self._advice(doubtful)
-            elif verdict == "unknown" and effects:
-                doubtful = effects[0].effect.name
+        with self.progress.timed("next experiment"):
+            doubtful, advice = found.doubtful(self.settings), None
+            if found.verdict == "ambiguous" and doubtful is not None:
+                advice = experiment_for(search, doubtful, self.rollouts, self._data_options)
             causes = surviving_causes(search, doubtful)
             self.progress.finish()
         return Discovery(
-            verdict=verdict,
+            verdict=found.verdict,
             reason=reason,
             preparation=self.preparation,
             problems=self.problems,
@@ -431,27 +317,27 @@ class Investigation:
             narrow_priors=self.narrow_priors,
             alarm=self.first.alarm,
             remainder=search.rounds[-1].alarm,
-            unexplained=unexplained,
+            unexplained=found.unexplained,
             where=self.where,
-            effects=effects,
+            effects=found.effects,
             ranking=self.first.ranking,
             separation=self.first.separation,
             separation_names=tuple(c.name for c in self.first.ranking[: SEARCH.num_leading]),
-            gap=gap,
-            anew=self._anew_of(final),
+            gap=found.gap,
+            anew=predictions.anew(final),
             next_experiment=advice,
             causes=causes,
             model=search.rounds[0].hypothesis.model,
             revised=final.model,
-            parameters=every,
-            draws=self._draws(final),
+            parameters=found.parameters,
+            draws=predictions.draws(final),
             counts=counts(final, self.rollouts),
-            overlays=self._overlays(final),
+            overlays=predictions.overlays(final, self.start),
             search=search,
             settings=self.settings,
             seed=self.seed,
             seconds=self.seconds,
-            learned=learned,
+            learned=found.learned,
         )
 
 
@@ -495,27 +381,3 @@ def discover(
             seed=seed,
             progress=report,
         ).conclude()
-
-
-def _unexplained(search: Search) -> float:
-    """Returns the share of the misfit that a further law could explain in the final model."""
-    done = explained(search.rounds[0].hypothesis, search.final)
-    left = search.rounds[-1].alarm.gain
-    return left / max(left + done, 1e-12)
-
-
-def _units(hypothesis: Hypothesis) -> dict[str, str]:
-    simulator = hypothesis.simulator
-    units = {parameter.name: parameter.unit for parameter in simulator.parameters}
-    for effect in simulator.effects:
-        own = effect.units(simulator.port(effect.port))
-        units |= {f"{effect.name}.{name}": unit for name, unit in own.items()}
-    return units
-
-
-def _like(data_options: DataOptions, rollouts: Rollouts, holdout: Rollouts) -> DataOptions:
-    """Returns options for segments of the same duration at the held-out sampling rate."""
-    length = data_options.steps(rollouts)
-    assert length is not None
-    steps = round(length * rollouts.time_step / holdout.time_step)
-    return replace(data_options, segment_length=max(2, steps))

@@ -1,5 +1,6 @@
 """The progress of a search of unknown length."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -19,9 +20,13 @@ class SearchProgress(Reporter):
 
     Args:
         show: As :func:`~npdr_ppl.progress.reporter` takes it.
+
+    Attributes:
+        seconds: Time spent, by stage.
     """
 
     def __init__(self, show: bool | Reporter | None = None) -> None:
+        self.seconds: dict[str, float] = {}
         self._show = show
         # The line of a larger workflow is there before and after the blocks.
         self._line = show if isinstance(show, Reporter) else Reporter()
@@ -35,6 +40,14 @@ class SearchProgress(Reporter):
                 yield
             finally:
                 self._line = before
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Shows the progress inside the block, and records how long it takes."""
+        begin = time.monotonic()
+        with self.shown():
+            yield
+        self.seconds[stage] = time.monotonic() - begin
 
     def stage(self, label: str, *, may_end_early: bool = False) -> Step:
         """Returns a callback for a stage that ends within the present block."""

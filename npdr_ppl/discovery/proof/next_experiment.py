@@ -16,6 +16,9 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.search.rounds import Search
+from npdr_ppl.discovery.search.settings import EVIDENCE
+from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effect_context import EquivalenceClass, Excitation
 from npdr_ppl.language.inputs import Inputs
@@ -24,7 +27,7 @@ from npdr_ppl.preparation.segment_fit import SegmentFit
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["NextExperiment", "excitation_commands", "next_experiment"]
+__all__ = ["NextExperiment", "excitation_commands", "experiment_for", "next_experiment"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,35 @@ class NextExperiment:
             "amplitude": self.amplitude,
             "separated_by": self.separated_by,
         }
+
+
+def experiment_for(
+    search: Search, name: str, rollouts: Rollouts, options: DataOptions
+) -> NextExperiment | None:
+    """Returns the experiment that would separate the likeliest alternatives to an effect.
+
+    Args:
+        search: The search that added the effect.
+        name: Name of the effect.
+        rollouts: The recording.
+        options: How it is cut into segments.
+
+    Returns:
+        ``None`` if the effect has no likely alternatives.
+    """
+    added = next(a for a in search.added if a.effect.name == name)
+    likeliest = sorted(added.alternatives, key=lambda n: added.alternatives[n], reverse=True)
+    names = [
+        n
+        for n in likeliest[: VERDICT.most_separated]
+        if added.alternatives[n] >= EVIDENCE.least_probability
+    ]
+    alternatives = [search.trials[added.place, n] for n in names]
+    if len(alternatives) < 2:
+        return None
+    ids = {name.rsplit(".", 1)[1] for name in names}
+    classes = [g for g in added.effect.equivalence if len(ids & set(g.members)) > 1]
+    return next_experiment(alternatives, rollouts, options, classes)
 
 
 def next_experiment(
