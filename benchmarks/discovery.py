@@ -317,10 +317,11 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         return None
     truth = {name: torch.tensor(v) for h in case.truth for name, v in h.sites.items()}
     truth |= {name: torch.tensor(value) for name, value in case.parameters.items()}
+    same = DataOptions(segment_length=given.segments.inputs.num_steps)
     true = fit_hypothesis(
         given.model,
         case.fit,
-        segment_options(case.fit),
+        segment_options(case.fit, same),
         effects=tuple(as_hidden(known[hidden.name], hidden) for hidden in case.truth),
         start={name: value.double() for name, value in truth.items()},
         max_steps=0,
@@ -329,7 +330,7 @@ def true_model_errors(case: Case, found: npdr.Discovery) -> dict[str, float] | N
         given,
         true,
         case.holdout,
-        segment_options(case.holdout),
+        segment_options(case.holdout, same),
         draws_before=posterior_draws(given, seed=0),
         draws_after=posterior_draws(true, seed=0),
         seed=0,
