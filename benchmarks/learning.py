@@ -34,7 +34,8 @@ from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
 from npdr_ppl.discovery.learning.proof import checks, misfit
 from npdr_ppl.discovery.learning.recorded_motion import motion_at_ports
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.discovery.segment_options import segment_options, short_segments
+from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 
 
@@ -47,7 +48,8 @@ def judge(task: Task, is_whole: bool) -> dict[str, Any]:
         truth = [f"{h.name} {dict(h.parameters)}" for h in case.truth]
         row |= {"strength": strength, "d": separation, "truth": truth}
         begin = time.process_time()
-        searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions())
+        short = short_segments(case.fit)
+        searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(), data_options=short)
         start = searcher.settled(searcher.fit_base(may_be_rough=True))
         if is_whole:
             search = npdr.DiscoveryOptions(effects=_catalogue(task, case), learn=True)
@@ -69,9 +71,10 @@ def judge(task: Task, is_whole: bool) -> dict[str, Any]:
 
 
 def _described(case: Case, learned: LearnedModel) -> dict[str, Any]:
-    options = segment_options(case.holdout)
+    same = DataOptions(segment_length=learned.start.segments.inputs.num_steps)
+    options = segment_options(case.holdout, same)
     null = make_case(case.rig, "null", (), seed=case.seed)
-    searcher = Searcher(null.model, null.fit, npdr.DiscoveryOptions())
+    searcher = Searcher(null.model, null.fit, npdr.DiscoveryOptions(), data_options=same)
     quiet = searcher.settled(searcher.fit_base(may_be_rough=True))
     scale = quiet.fit.scale
     along = SegmentModel(learned.start.model, case.holdout, options)

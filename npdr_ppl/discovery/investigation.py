@@ -10,7 +10,7 @@ from npdr_ppl.discovery.conclusion import Conclusion, conclusion_of, with_law
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Discovery
 from npdr_ppl.discovery.finding_of import findings_of
-from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_hypothesis
 from npdr_ppl.discovery.learning.assumptions import Assumptions
 from npdr_ppl.discovery.learning.result import Learned, learn
 from npdr_ppl.discovery.predictions import Predictions, held_out_options
@@ -28,8 +28,9 @@ from npdr_ppl.discovery.search.parts import PartResult, found_in_parts
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond
 from npdr_ppl.discovery.search.rounds import Round, Search
 from npdr_ppl.discovery.search.settings import SEARCH
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.search_progress import SearchProgress
-from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.discovery.segment_options import segment_options, short_segments
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.model import Model
@@ -100,6 +101,7 @@ class Investigation:
         self.progress = SearchProgress(progress)
         self.seconds = self.progress.seconds
         self._data_options = segment_options(rollouts, options)
+        self._short_options = short_segments(rollouts, options)
         self._deadline = Deadline(self.settings.time_limit)
 
     @cached_property
@@ -254,11 +256,12 @@ class Investigation:
         """
         search, holdout, options = self.search, self.holdout, None
         if holdout is not None:
-            options = held_out_options(self._data_options, self.rollouts, holdout)
-        starts = [self.start, *([search.final] if search.added else [])]
+            options = held_out_options(self._short_options, self.rollouts, holdout)
+        begun = [self.start, *([search.final] if search.added else [])]
         with self.progress.timed("learn"):
-            return learn(
-                self._searcher.trials,
+            starts = [self._in_short_segments(start) for start in begun]
+            found = learn(
+                Trials(starts[0].segments),
                 starts,
                 candidates_at(self.start, self.settings),
                 holdout=holdout,
@@ -266,6 +269,22 @@ class Investigation:
                 assumptions=Assumptions(self.settings.symmetry, self.settings.is_passive),
                 report=self.progress.say,
             )
+            if found is None or starts[0] is begun[0]:
+                return found
+            number = [start is found.model.start for start in starts].index(True)
+            return found.fitted_along(begun[number], self._searcher.trials)
+
+    def _in_short_segments(self, hypothesis: Hypothesis) -> Hypothesis:
+        """Returns a model that is fitted to short segments; see :func:`short_segments`."""
+        if self._short_options == self._data_options:
+            return hypothesis
+        return fit_hypothesis(
+            hypothesis.model,
+            self.rollouts,
+            self._short_options,
+            effects=hypothesis.effects,
+            start=hypothesis.parameters,
+        )
 
     @property
     def preparation(self) -> PreparationSummary:

@@ -8,10 +8,11 @@ from npdr_ppl.preparation.data_options import (
     FEWEST_STEPS,
     DataOptions,
     checked_options,
+    short_segment_length,
 )
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["segment_options"]
+__all__ = ["segment_options", "short_segments"]
 
 
 def segment_options(rollouts: Rollouts, options: DataOptions | None = None) -> DataOptions:
@@ -50,3 +51,19 @@ def segment_options(rollouts: Rollouts, options: DataOptions | None = None) -> D
             f"{fewest} steps; record more, or choose a shorter segment_length."
         )
     return replace(options, embedding=None, segment_length=length)
+
+
+def short_segments(rollouts: Rollouts, options: DataOptions | None = None) -> DataOptions:
+    """Returns the options with which a law is learned: by default, short segments.
+
+    Formulas are compared by what they change in a motion to first order. In a long segment, what a
+    model misses carries the motion too far for that.
+
+    Args:
+        rollouts: The recording.
+        options: How it is prepared, before :func:`segment_options`; the defaults if ``None``.
+    """
+    options = checked_options(options)
+    if options.segment_length == "auto":
+        options = replace(options, segment_length=short_segment_length(rollouts))
+    return segment_options(rollouts, options)

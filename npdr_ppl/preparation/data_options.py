@@ -18,6 +18,7 @@ __all__ = [
     "SegmentLength",
     "checked_options",
     "default_segment_length",
+    "short_segment_length",
     "one_of_each_part",
 ]
 
@@ -61,10 +62,18 @@ def default_segment_length(rollouts: Rollouts) -> int:
     recording that would have fewer than ``FEWEST_SEGMENTS`` segments of this length is cut into
     twice ``FEWEST_SEGMENTS``.
     """
-    total = rollouts.num_usable
-    slow = min(rollouts.motion_time / rollouts.time_step, total // MANY_SEGMENTS)
-    length = round(max(SEGMENT_SECONDS / rollouts.time_step, slow))
-    length = max(FEWEST_STEPS, min(MOST_STEPS, length))
+    slow = min(rollouts.motion_time / rollouts.time_step, rollouts.num_usable // MANY_SEGMENTS)
+    return _length_near(round(max(SEGMENT_SECONDS / rollouts.time_step, slow)), rollouts)
+
+
+def short_segment_length(rollouts: Rollouts) -> int:
+    """Returns the default length in steps without regard to how slow the motion is."""
+    return _length_near(round(SEGMENT_SECONDS / rollouts.time_step), rollouts)
+
+
+def _length_near(length: int, rollouts: Rollouts) -> int:
+    """Returns a length in steps within the bounds that every default has."""
+    length, total = max(FEWEST_STEPS, min(MOST_STEPS, length)), rollouts.num_usable
     if total >= FEWEST_SEGMENTS * length:
         return length
     return max(2, min(length, total // (2 * FEWEST_SEGMENTS)))

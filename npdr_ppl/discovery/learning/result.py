@@ -13,7 +13,7 @@ from npdr_ppl.discovery.learning.curves import Curve, curves
 from npdr_ppl.discovery.learning.effect_source import module_source
 from npdr_ppl.discovery.learning.formulas import NO_ASSUMPTIONS, PortFormulas
 from npdr_ppl.discovery.learning.law import Law
-from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model
+from npdr_ppl.discovery.learning.learn import LearnedModel, learned_model, with_values
 from npdr_ppl.discovery.learning.proof import Check, checks
 from npdr_ppl.discovery.learning.settings import LEARNING
 from npdr_ppl.discovery.learning.term import HISTORY
@@ -77,6 +77,22 @@ class Learned:
             reason: Why they are not.
         """
         return replace(self, reason=reason, is_offered=False)
+
+    def fitted_along(self, start: Hypothesis, trials: Trials) -> "Learned":
+        """Returns the result with the model and its laws fitted along other segments.
+
+        Args:
+            start: The model without the laws, fitted along those segments.
+            trials: Fits of the model along them.
+        """
+        model = self.model
+        known = model.hypothesis.parameters
+        again = trials.refitted(start, model.hypothesis.effects, start=known)
+        if again is None:
+            return self.withdrawn(f"{self.reason} But the model cannot be simulated with it.")
+        laws = tuple(with_values(law, again.parameters) for law in model.laws)
+        model = replace(model, start=start, hypothesis=again, laws=laws)
+        return replace(self, model=model, reason=_reason(laws, self.checks))
 
     def source(self, about: str = "") -> str:
         """Returns the source of a file with the learned effects.
@@ -176,21 +192,24 @@ def learn(
     model = min(found, key=cost)
     report("fitting each half")
     every = checks(model, holdout, options)
-    worse = [check for check in every if not check.helps]
-    texts = ", ".join(f"{law.formula_with_numbers} at {law.port.name}" for law in model.laws)
-    if worse:
-        reason = f"The law {texts} does not help in {worse[0].where}."
-    else:
-        reason = f"Learned: {texts}."
     return Learned(
         model,
         tuple(every),
         {port.motion.port.name: _dependence(port) for port in model.ports[: LEARNING.num_fitted]},
         _alike(model, candidates),
         tuple(curves(model)),
-        reason,
-        not worse,
+        _reason(model.laws, every),
+        all(check.helps for check in every),
     )
+
+
+def _reason(laws: Sequence[Law], every: Sequence[Check]) -> str:
+    """Returns why laws are offered or not, in a sentence."""
+    texts = ", ".join(f"{law.formula_with_numbers} at {law.port.name}" for law in laws)
+    worse = [check for check in every if not check.helps]
+    if worse:
+        return f"The law {texts} does not help in {worse[0].where}."
+    return f"Learned: {texts}."
 
 
 def _dependence(port: PortFormulas) -> dict[str, float]:

@@ -13,7 +13,7 @@ from npdr_ppl.discovery.learning.recorded_motion import motion_at_ports
 from npdr_ppl.discovery.learning.regression import Formula
 from npdr_ppl.discovery.learning.terms import terms_at
 from npdr_ppl.discovery.search.trials import Trials
-from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.discovery.segment_options import short_segments
 from npdr_ppl.errors import DataError
 from tests.helpers.port_motions import COMMAND, JOINT
 
@@ -55,7 +55,7 @@ def test_a_passive_law_only_brakes():
 def test_a_passive_law_is_learned_of_friction_that_depends_on_the_position():
     place = ("hinge", "position_dependent_friction")
     case = make_case("pendulum", "outside", (place,), strength=2.0, seed=2001)
-    start = fit_hypothesis(case.model, case.fit, segment_options(case.fit))
+    start = fit_hypothesis(case.model, case.fit, short_segments(case.fit))
     assumptions = Assumptions(is_passive=True)
     model = learned_model(Trials(start.segments), start, assumptions=assumptions)
     assert model is not None

@@ -9,7 +9,7 @@ from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.learning.learn import learned_model
 from npdr_ppl.discovery.learning.proof import checks
 from npdr_ppl.discovery.search.trials import Trials
-from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.discovery.segment_options import short_segments
 from npdr_ppl.language.handlers import add_effect
 from npdr_ppl.models.effects import QuadraticDrag
 
@@ -17,12 +17,12 @@ from npdr_ppl.models.effects import QuadraticDrag
 def learned_from(place, strength, rig="pendulum", condition="outside"):
     """The truth, the laws learned of a case, and how they were checked."""
     case = make_case(rig, condition, (place,), strength=strength, seed=2001)
-    options = segment_options(case.fit)
+    options = short_segments(case.fit)
     start = fit_hypothesis(case.model, case.fit, options)
     model = learned_model(Trials(start.segments), start)
     assert model is not None
     (law,) = model.laws
-    found = checks(model, case.holdout, segment_options(case.holdout))
+    found = checks(model, case.holdout, short_segments(case.holdout))
     return case.truth[0].parameters, law, found
 
 
@@ -79,7 +79,7 @@ def test_a_discovery_writes_the_learned_effect_and_a_model_that_has_it(tmp_path)
     effect = space["LearnedHinge"]("hinge")
     revised = add_effect(case.model, effect)
     before, after = (
-        fit_hypothesis(m, case.fit, segment_options(case.fit)) for m in (case.model, revised)
+        fit_hypothesis(m, case.fit, short_segments(case.fit)) for m in (case.model, revised)
     )
     assert float(after.fit.scale.log().sum()) < float(before.fit.scale.log().sum())
     assert "class LearnedHinge(ForceEffect):" in (tmp_path / "revised_model.py").read_text()
