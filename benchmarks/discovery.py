@@ -48,9 +48,10 @@ SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 
 SEPARATIONS = (5.0, 10.0, 30.0)
 CHECKABLE, MEASURABLE = 30.0, 40.0
-"""From which separation on it stands out of the noise, and one that is measured well. On another
-trajectory, other directions of the noise are taken for initial states: by chance alone, two
-recordings of a Furuta pendulum differ by up to 10."""
+"""From which separation on it stands out of the noise, and one that is measured well. Two
+recordings of a Furuta pendulum already differ by up to 10 if they only have noise, because fitted
+initial states absorb other parts of it. So smaller separations are scaled down from
+``MEASURABLE``."""
 
 NEARLY, TRIES = 1.5, 12
 """How many times the wanted separation is not too much, and how many strengths are tried."""

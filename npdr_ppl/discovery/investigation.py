@@ -279,7 +279,7 @@ class Investigation:
         if self._short_options == self._data_options:
             return hypothesis
         return fit_hypothesis(
-            hypothesis.model,
+            self.start.model,
             self.rollouts,
             self._short_options,
             effects=hypothesis.effects,

@@ -119,7 +119,7 @@ class Judge:
         return batch, every, max(1, min(batch // 2, PLANNING.most_steps // steps))
 
     def _default_length(self) -> int:
-        """Returns the steps of a segment with which one such recording would be cut."""
+        """Returns the steps of a segment with which one such recording of a fast motion is cut."""
         steps = self.limits.num_steps
         return default_segment_length(
             self._recorded(

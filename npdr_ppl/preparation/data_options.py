@@ -28,17 +28,21 @@ not fit in the cache, and the allocator maps their memory again every time. With
 overhead of the calls dominates."""
 
 SEGMENT_SECONDS = 0.2
-"""Least default length of a segment in s. It is long compared with delays and lags, and short
-compared with the time in which an unstable motion amplifies errors of the initial state."""
+"""Default length of a segment in s, unless the motion is slow. It is long compared with delays
+and lags, and short compared with the time in which an unstable motion amplifies errors of the
+initial state."""
 
 FEWEST_STEPS, MOST_STEPS = 20, 200
 """Bounds of a segment's default length in steps. Shorter segments need most of their measurements
 for their initial states. Longer ones need more memory and contain no more information."""
 
-FEWEST_SEGMENTS, MANY_SEGMENTS = 8, 32
-"""Least number of segments of a recording that is long enough, and of one that is cut into longer
-segments because it is slow. With fewer than the least, a test cannot distinguish an effect from
-chance."""
+FEWEST_SEGMENTS = 8
+"""Least number of segments of a recording that is long enough. With fewer, a test cannot
+distinguish an effect from chance."""
+
+MANY_SEGMENTS = 4 * FEWEST_SEGMENTS
+"""Least number of segments that are longer because the motion is slow: four times as many, so that
+halves of the recording and halves of these can be tested."""
 
 MOST_READINGS = 80_000
 """Greatest number of measurements that a fit uses, in at least ``FEWEST_SEGMENTS`` segments; 11 s

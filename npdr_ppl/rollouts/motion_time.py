@@ -10,11 +10,11 @@ from npdr_ppl.rollouts.arrays import Array
 __all__ = ["motion_time"]
 
 BENT = 2.0 * (1.0 - math.cos(1.0))
-"""Mean square of a sine's second differences over a radian of its phase, relative to that of its
-first differences; 3 for noise, whatever the time."""
+"""Limit of the mean square of second differences, relative to that of first differences: its value
+for a sine sampled one radian apart. White noise has 3 at every lag."""
 
 MOST_LAGS = 200
-"""Greatest number of steps of a time that is looked for."""
+"""Longest time that is tried, in steps."""
 
 MOST_DIFFERENCES = 20_000
 """Number of differences that are averaged for a lag; more change nothing and take longer."""
@@ -24,9 +24,10 @@ def motion_time(stretches: Sequence[Array], time_step: float) -> float:
     """Returns the time in s after which a motion is no longer a straight line.
 
     Over shorter times, a channel's values follow from the value and the rate at the beginning. A
-    sine of frequency f has the time 1/(2π f), which is one radian of its phase. Several channels
-    have the median. Noise and channels that stand still have no such time; if all are of this
-    kind, it is 0. It is at most ``MOST_LAGS`` steps.
+    sine of frequency f has the time 1/(2π f), which is one radian of its phase. With several
+    channels, the median is returned, at most ``MOST_LAGS`` steps. Noise and channels that stand
+    still have no such time, and white noise of more than a tenth of the amplitude hides it.
+    Without any, 0 is returned.
 
     Args:
         stretches: Measurements without gaps, ``(N, C)`` each.
@@ -58,8 +59,8 @@ def _bends(stretches: Sequence[Array]) -> Array:
 def _lag(bent: Array) -> int:
     """Returns the first lag at which a channel bends, after lags at which it does not.
 
-    Where noise hides that it does not bend over the shortest times, it does so over longer ones.
-    The lag is 0 if there is none at which it does not bend, or if it stands still.
+    Noise hides short straight lines, so lags before the first straight one are skipped. The lag is
+    0 if there is no straight one, or if the channel stands still.
     """
     is_straight = (bent > 0.0) & (bent < BENT)
     if not is_straight.any():

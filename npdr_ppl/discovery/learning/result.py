@@ -20,6 +20,7 @@ from npdr_ppl.discovery.learning.term import HISTORY
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.search.evidence import closest
+from npdr_ppl.discovery.search.rounds import explained
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.preparation.data_options import DataOptions
@@ -81,6 +82,8 @@ class Learned:
     def fitted_along(self, start: Hypothesis, trials: Trials) -> "Learned":
         """Returns the result with the model and its laws fitted along other segments.
 
+        Checks and curves stay those of the segments along which the laws were learned.
+
         Args:
             start: The model without the laws, fitted along those segments.
             trials: Fits of the model along them.
@@ -88,8 +91,8 @@ class Learned:
         model = self.model
         known = model.hypothesis.parameters
         again = trials.refitted(start, model.hypothesis.effects, start=known)
-        if again is None:
-            return self.withdrawn(f"{self.reason} But the model cannot be simulated with it.")
+        if again is None or explained(start, again) <= 0.0:
+            return self.withdrawn(f"{self.reason} But it explains nothing of longer segments.")
         laws = tuple(with_values(law, again.parameters) for law in model.laws)
         model = replace(model, start=start, hypothesis=again, laws=laws)
         return replace(self, model=model, reason=_reason(laws, self.checks))

@@ -155,9 +155,9 @@ def tried_before(
 def with_simple_forms(effect: Effect, alternatives: Alternatives, trials: Trials) -> Alternatives:
     """Fits simple laws once more, from where a law that contains them fits better.
 
-    Without the effects, the parameters may be far from where they are with one of them, and the
-    fits of two laws may end in different places. A law that contains another one then seems better
-    only because of its place.
+    Without the effects, the parameters may be far from where they are with one of them. The fit of
+    a simple law may then end in a local minimum, and a law that contains it seems better only
+    for this reason.
 
     Args:
         effect: The effect.
@@ -169,19 +169,22 @@ def with_simple_forms(effect: Effect, alternatives: Alternatives, trials: Trials
     losses = {name: float(model.losses(scale).sum()) for name, model in models.items()}
     best = min(losses, key=lambda name: losses[name])
     law = next(e for e in models[best].effects if e.name == best)
-    worse = [
-        (name, next(e for e in model.effects if e.name == name))
+    simple = [
+        e
         for name, model in models.items()
-        if models[best].share * (losses[name] - losses[best]) > EVIDENCE.indistinct_loss
+        for e in model.effects
+        if e.name == name
+        and e.port == law.port
+        and e.id in law.contains
+        and models[best].share * (losses[name] - losses[best]) > EVIDENCE.indistinct_loss
     ]
-    asked = [(n, e) for n, e in worse if e.port == law.port and e.id in law.contains]
-    if not asked:
+    if not simple:
         return alternatives
     others = tuple(e for e in models[best].effects if e.name != best)
-    fitted = trials.each_refitted(models[best], [(*others, e) for _, e in asked])
-    for (name, _), found in zip(asked, fitted, strict=True):
-        if found is not None and float(found.losses(scale).sum()) < losses[name]:
-            models[name] = found
+    fitted = trials.each_refitted(models[best], [(*others, e) for e in simple])
+    for e, found in zip(simple, fitted, strict=True):
+        if found is not None and float(found.losses(scale).sum()) < losses[e.name]:
+            models[e.name] = found
     return Alternatives(alternatives.without, models.pop(effect.name), models)
 
 

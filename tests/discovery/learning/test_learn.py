@@ -1,17 +1,22 @@
 """Laws that are in no catalogue, learned from recordings that other equations made."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery import Investigation
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.learning.learn import learned_model
 from npdr_ppl.discovery.learning.proof import checks
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import short_segments
 from npdr_ppl.language.handlers import add_effect
-from npdr_ppl.models.effects import QuadraticDrag
+from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag
+from npdr_ppl.models.pendulum import pendulum
+from tests.helpers.pendulum_recordings import swinging
 
 
 def learned_from(place, strength, rig="pendulum", condition="outside"):
@@ -129,3 +134,15 @@ def test_a_wave_in_time_is_learned_with_its_frequency():
     (frequency,) = (s.value for t in law.terms for s in t.shapes if s.name == "frequency")
     assert frequency == pytest.approx(true["frequency"], rel=0.01)
     assert all(check.helps for check in found)
+
+
+def test_a_model_with_effects_is_fitted_to_short_segments_too():
+    options = npdr.DiscoveryOptions(effects=(CoulombFriction("hinge"),), repeat=False)
+    investigation = Investigation(pendulum, swinging(friction=0.2), search=options)
+    investigation._short_options = replace(investigation._data_options, segment_length=10)
+    final = investigation.search.final
+    found = investigation._in_short_segments(final)
+    assert found.names == final.names == ("hinge.coulomb_friction",)
+    assert found.segments.inputs.num_steps == 10
+    friction = float(found.parameters["hinge.coulomb_friction.magnitude"])
+    assert friction == pytest.approx(0.2, rel=0.15)
