@@ -38,10 +38,10 @@ from npdr_ppl.discovery.proof.parameter_intervals import posterior_draws
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.discovery.segment_options import segment_options, short_segments
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
-from npdr_ppl.preparation.data_options import FEWEST_STEPS, SEGMENT_SECONDS, DataOptions
+from npdr_ppl.preparation.data_options import DataOptions
 
 SEEDS = {"tune": range(100), "test": range(1000, 1100)}
 """Seeds of both parts."""
@@ -292,7 +292,7 @@ def _quiet(rig: str, seed: int) -> Hypothesis:
 
 def _segments(case: Case) -> DataOptions:
     """Returns segments of the same length whatever is hidden, so that losses can be compared."""
-    return DataOptions(None, max(FEWEST_STEPS, round(SEGMENT_SECONDS / case.fit.time_step)))
+    return short_segments(case.fit)
 
 
 def _catalogue(task: Task, case: Case) -> tuple[npdr.Effect, ...] | None:

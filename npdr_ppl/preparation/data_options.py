@@ -18,8 +18,8 @@ __all__ = [
     "SegmentLength",
     "checked_options",
     "default_segment_length",
-    "short_segment_length",
     "one_of_each_part",
+    "short_segment_length",
 ]
 
 MAX_READINGS_PER_CHUNK = 2_000_000

@@ -8,7 +8,12 @@ from hidden_rigs import make_case
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.variants import candidates_at
-from npdr_ppl.discovery.search.alternatives import Alternatives, _strains, with_simple_forms
+from npdr_ppl.discovery.search.alternatives import (
+    Alternatives,
+    _strains,
+    weigh_alternatives,
+    with_simple_forms,
+)
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.parsimony import lost_share, overlap, plausible_laws, simplest_laws
 from npdr_ppl.models.effects import (
@@ -71,6 +76,12 @@ def test_a_simple_law_is_fitted_again_where_one_that_contains_it_fits_better(rub
     assert float(again.parameters[f"{dry.name}.magnitude"]) == pytest.approx(0.2, rel=0.1)
     # Once it fits as well, nothing is fitted.
     assert with_simple_forms(drift, found, None) is found
+    # The model that was asked about is replaced by the better fit, unless the time is over.
+    asked = Alternatives(base, stuck, {drift.name: known.with_it})
+    better = with_simple_forms(dry, asked, searcher.trials)
+    chosen, added = weigh_alternatives(base, stuck, dry, better)
+    assert better.is_better and chosen is better.with_it and added.effect.name == dry.name
+    assert with_simple_forms(dry, asked, None, lambda: True) is asked
 
 
 @pytest.mark.parametrize("law", [PreslidingFriction, StribeckFriction, FrictionDrift])

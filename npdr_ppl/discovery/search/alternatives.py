@@ -1,7 +1,7 @@
 """Alternatives: other effects that could replace one effect, given all the others."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
@@ -81,11 +81,13 @@ class Alternatives:
         without: The model without the effect.
         with_it: The model with the effect, with the same initial states as the alternatives.
         others: The model with each alternative in the effect's place, by name.
+        is_better: Whether the model with the effect fits better than when it was asked about.
     """
 
     without: Hypothesis
     with_it: Hypothesis
     others: dict[str, Hypothesis]
+    is_better: bool = False
 
 
 def find_alternatives(
@@ -152,7 +154,12 @@ def tried_before(
     return None
 
 
-def with_simple_forms(effect: Effect, alternatives: Alternatives, trials: Trials) -> Alternatives:
+def with_simple_forms(
+    effect: Effect,
+    alternatives: Alternatives,
+    trials: Trials,
+    stops: Callable[[], bool] = lambda: False,
+) -> Alternatives:
     """Fits simple laws once more, from where a law that contains them fits better.
 
     Without the effects, the parameters may be far from where they are with one of them. The fit of
@@ -163,6 +170,7 @@ def with_simple_forms(effect: Effect, alternatives: Alternatives, trials: Trials
         effect: The effect.
         alternatives: Its alternatives.
         trials: Fits the model.
+        stops: Returns whether nothing more is to be fitted; called only if something is.
     """
     models = {effect.name: alternatives.with_it} | alternatives.others
     scale = closest(list(models.values())).fit.scale
@@ -178,14 +186,16 @@ def with_simple_forms(effect: Effect, alternatives: Alternatives, trials: Trials
         and e.id in law.contains
         and models[best].share * (losses[name] - losses[best]) > EVIDENCE.indistinct_loss
     ]
-    if not simple:
+    if not simple or stops():
         return alternatives
     others = tuple(e for e in models[best].effects if e.name != best)
     fitted = trials.each_refitted(models[best], [(*others, e) for e in simple])
     for e, found in zip(simple, fitted, strict=True):
         if found is not None and float(found.losses(scale).sum()) < losses[e.name]:
             models[e.name] = found
-    return Alternatives(alternatives.without, models.pop(effect.name), models)
+    with_it = models.pop(effect.name)
+    is_better = with_it is not alternatives.with_it
+    return Alternatives(alternatives.without, with_it, models, is_better)
 
 
 def weigh_alternatives(
@@ -237,7 +247,8 @@ def weigh_alternatives(
     whole, lost = (float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without))
     share = max(0.0, lost) / max(whole, 1e-12)
     fitting = _fitting(trials, best)
-    swapped = current if best == effect.name else swapped
+    if best == effect.name and not alternatives.is_better:
+        swapped = current
     return swapped, Added(chosen, effect.name, share, weights, fitting)
 
 

@@ -61,9 +61,8 @@ def with_rivals(
         of_each = _alternatives(asked, waiting, rounds, trials, options, stops)
         for effect, (alternatives, is_tried) in zip(waiting, of_each, strict=True):
             waiting = waiting[1:]
-            known = alternatives
-            if alternatives is not None and not stops():
-                alternatives = with_simple_forms(effect, alternatives, trials)
+            if alternatives is not None:
+                alternatives = with_simple_forms(effect, alternatives, trials, stops)
             current, found = weigh_alternatives(
                 rounds[0].hypothesis,
                 asked,
@@ -77,13 +76,6 @@ def with_rivals(
             else:
                 report(f"{effect.name}: probability {found.alternatives[effect.name]:.2f}")
             added.append(found)
-            if (
-                known is not None
-                and alternatives is not None
-                and alternatives.with_it is not known.with_it
-                and found.effect.name == effect.name
-            ):
-                current = alternatives.with_it  # it fits better than before
             # Only models with the same initial states can be compared.
             models = {effect.name: asked}
             if alternatives is not None:
