@@ -126,7 +126,9 @@ class EncoderScale(SensorEffect):
         """Removes the scale error."""
         return reading / (1.0 + parameters["error"])
 
-    def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+    def initial_rate(
+        self, rate: Tensor, value: Tensor, parameters: Mapping[str, Tensor]
+    ) -> Tensor:
         """Removes the scale error."""
         return rate / (1.0 + parameters["error"])
 

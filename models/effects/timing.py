@@ -115,7 +115,9 @@ class ClockSkew(SensorEffect):
         """Returns κ t."""
         return parameters["skew"] * time
 
-    def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+    def initial_rate(
+        self, rate: Tensor, value: Tensor, parameters: Mapping[str, Tensor]
+    ) -> Tensor:
         """Removes the time's scale."""
         return rate / (1.0 + parameters["skew"])
 

@@ -22,6 +22,10 @@ from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["class_source", "module_source"]
 
+SLOPE_STEP = 1e-5
+"""Step of the central difference of a sensor's error, rad or m: far below the shortest waves that
+are learned, and far above rounding."""
+
 _BASES = {
     "force": "ForceEffect",
     "action": "ActionEffect",
@@ -327,6 +331,13 @@ def _sensor_methods(law: Law) -> list[str]:
         '        """Removes the error, in two steps."""',
         "        nearly = reading - self.error(reading, parameters)",
         "        return reading - self.error(nearly, parameters)",
+        "",
+        "    def initial_rate(self, rate, value, parameters):",
+        '        """Removes the rate of the error, by a central difference."""',
+        f"        step = {SLOPE_STEP:g}",
+        "        above = self.error(value + step, parameters)",
+        "        below = self.error(value - step, parameters)",
+        "        return rate / (1.0 + (above - below) / (2.0 * step))",
         "",
         "    def read(self, value, parameters, memory, time_step):",
         '        """Returns the value with the error."""',

@@ -87,6 +87,7 @@ def true_start(
     if not chain.sensors.effects:
         return recorded.states
     states = chain.simulator.states
+    places = {state.name: i for i, state in enumerate(states)}
     sensors = {sensor.name: i for i, sensor in enumerate(chain.simulator.sensors)}
     true = list(recorded.states)
     for place, effect, columns in chain.sensors.effects:
@@ -95,9 +96,10 @@ def true_start(
             if sensors.get(state.name) in columns:
                 value = effect.initial_value(value, tables.effects[place])
             if recorded.is_derived[i]:
-                rate = true[i]
-                if sensors.get(state.rate_of or "") in columns:
-                    rate = effect.initial_rate(rate, tables.effects[place])
+                rate, position = true[i], state.rate_of or ""
+                if sensors.get(position) in columns and position in places:
+                    here = true[places[position]]
+                    rate = effect.initial_rate(rate, here, tables.effects[place])
                 # At the first sample of a rollout, measured velocities are used; see
                 # Simulator.initial_states.
                 value = torch.where(recorded.time == 0.0, value, rate)

@@ -52,11 +52,18 @@ class SensorEffect(Effect):
         """
         return reading
 
-    def initial_rate(self, rate: Tensor, parameters: Mapping[str, Tensor]) -> Tensor:
+    def initial_rate(
+        self, rate: Tensor, value: Tensor, parameters: Mapping[str, Tensor]
+    ) -> Tensor:
         """Returns the true rate of change for a rate derived from successive measurements.
 
         By default it is the rate itself. Effects with a wrong scale of measurements or time stamps
         must remove it.
+
+        Args:
+            rate: The derived rate at the segment's start.
+            value: True value of the channel there.
+            parameters: The effect's parameters by short name.
         """
         return rate
 

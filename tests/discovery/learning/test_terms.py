@@ -93,6 +93,21 @@ def test_a_sensor_reads_in_the_file_what_the_term_says():
         assert torch.allclose(found - y, expected, rtol=1e-4, atol=1e-5), term.key
 
 
+def test_a_segment_starts_with_the_velocity_that_the_sensors_error_hides():
+    for term in terms_at(SENSOR):
+        law = law_with(SENSOR, term)
+        # Small errors, as of sensors.
+        law = replace(law, coefficients=tuple(0.03 * c for c in law.coefficients))
+        (effect,), values = effects_of([law])
+        parameters = {name.rpartition(".")[2]: value for name, value in values.items()}
+        # Not at the ends of splines, where the slope jumps.
+        y = (0.99 * SENSOR.values["y"].flatten()).requires_grad_()
+        reading, _ = effect.read(y, parameters, None, 0.01)
+        (slope,) = torch.autograd.grad(reading.sum(), y)
+        rate = effect.initial_rate(0.7 * slope, y.detach(), parameters)
+        assert torch.allclose(rate, torch.full_like(rate, 0.7), rtol=1e-6), term.key
+
+
 def test_terms_have_unique_names_and_costs_that_count_their_columns():
     for motion in (JOINT, COMMAND, SENSOR):
         terms = terms_at(motion)
