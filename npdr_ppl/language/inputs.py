@@ -18,6 +18,8 @@ _STARTS = (
     "initial_rate_errors",
 )
 
+_MEASUREMENTS = "is_read", "lateness", "is_zero"
+
 
 @dataclass(frozen=True)
 class Inputs:
@@ -55,6 +57,9 @@ class Inputs:
             no recording, or if they would take more than 32 MiB.
         recorded_readings: Measurements before each step of whole rollouts, ``(R, T, C)``; forces
             and servos that depend on past motion need them. ``None`` likewise.
+        is_zero: Whether the value, then the rate, of each channel is zero within its error at the
+            first sample of a rollout, ``(S, 2, C)``; false for other segments. ``None`` if
+            recorded states are assumed to be exact.
     """
 
     actions: Tensor
@@ -74,6 +79,7 @@ class Inputs:
     lateness: Tensor | None = None
     recorded_actions: Tensor | None = None
     recorded_readings: Tensor | None = None
+    is_zero: Tensor | None = None
 
     def __post_init__(self) -> None:
         """Checks that the shapes match."""
@@ -304,10 +310,9 @@ class Inputs:
         return torch.where(late == 0.0, trajectory, moved)
 
     def _sampling(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-        """Applies a function to ``is_read`` and ``lateness``, unless they are ``None``."""
-        if self.is_read is None or self.lateness is None:
-            return {}
-        return {"is_read": change(self.is_read), "lateness": change(self.lateness)}
+        """Applies a function to the fields ``(S, …, C)`` of measurements that are not ``None``."""
+        values = {name: getattr(self, name) for name in _MEASUREMENTS}
+        return {name: change(value) for name, value in values.items() if value is not None}
 
     def _starts(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         """Applies a function to the fields of initial states that are not ``None``."""

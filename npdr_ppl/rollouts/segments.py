@@ -124,9 +124,12 @@ def cut(
         if initial_state == "uncertain":
             starts["initial_value_errors"] = estimate.value_errors
             starts["initial_rate_errors"] = estimate.rate_errors
-    sampling = {}
+    sampling: dict[str, Tensor] = {}
+    if initial_state != "recorded":
+        is_first = np.array([start == 0 for _, start, _ in layout])
+        sampling["is_zero"] = torch.tensor(estimate.is_zero & is_first[:, None, None])
     if rollouts.samplings:
-        sampling = {
+        sampling |= {
             "is_read": torch.tensor(_compared(rollouts, layout, num_steps)),
             "lateness": torch.tensor(
                 _after_steps(rollouts, layout, num_steps, "lateness"), dtype=dtype

@@ -67,6 +67,13 @@ class StateEstimate:
     value_errors: Array
     rate_errors: Array
 
+    @property
+    def is_zero(self) -> NDArray[np.bool_]:
+        """Whether values, then rates, are zero within their errors, ``(P, 2, C)``."""
+        values = np.stack((self.values, self.rates), axis=1)
+        errors = np.stack((self.value_errors, self.rate_errors), axis=1)
+        return np.asarray(abs(values) <= CONFIDENCE * errors)
+
 
 def estimate_states(
     readings: Array,

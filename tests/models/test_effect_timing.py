@@ -125,11 +125,38 @@ def test_late_positions_are_read_along_a_parabola_and_velocities_along_a_line():
     free = FREE | {"position,velocity.sensor_delay.delay": 0.0027}
     push = replay(Emps(integrator="rk4"), FREE, [1.0] * 30)
     acceleration = push[-1, 1] / (30 * Emps.time_step)
-    out = replay(simulator, free, [1.0] * 30, past_actions=torch.ones(1, 8, 1).double())
+    before = torch.ones(1, 8, 1).double()
+    out = replay(simulator, free, [1.0] * 30, step=8, past_actions=before)
     late = Emps.time_step * torch.arange(1, 31, dtype=torch.float64)
     # What was read at the start is the state of then; the motion began by the delay earlier.
     expected = torch.stack((0.5 * acceleration * late**2, acceleration * late), dim=-1)
     torch.testing.assert_close(out, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0027, 0.01])
+def test_late_sensors_show_a_robot_that_is_released_from_rest_where_it_was_held(delay):
+    """Its fall begins with the rollout, not earlier, and is read late."""
+    simulator = Pendulum(integrator="rk4").with_effects(SensorDelay("angle,velocity"))
+    given = {"angle,velocity.sensor_delay.delay": delay}
+    num, step = 30, Pendulum.time_step
+    out = replay(simulator, given, [0.0] * num, start=[1.0, 0.0])
+    acceleration = replay(Pendulum(integrator="rk4"), {}, [0.0], start=[1.0, 0.0], time_step=1e-4)
+    acceleration = acceleration[0, 1] / 1e-4
+    late = (step * torch.arange(1, 4, dtype=torch.float64) - delay).clamp_min(0.0)
+    torch.testing.assert_close(out[:3, 1], acceleration * late, rtol=0.01, atol=1e-9)
+    # A parabola through two equal values and the first that moves is off by a h²/8 at most.
+    most = float(acceleration.abs()) * step**2 / 8.0
+    torch.testing.assert_close(
+        out[:3, 0], 1.0 + 0.5 * acceleration * late**2, rtol=0.0, atol=1.1 * most
+    )
+
+
+def test_a_robot_that_begins_in_motion_moved_before():
+    simulator = Pendulum(integrator="rk4").with_effects(SensorDelay("angle,velocity"))
+    given = {"angle,velocity.sensor_delay.delay": 0.01}
+    out = replay(simulator, given, [0.0] * 30, start=[1.0, 0.5])
+    on_time = replay(Pendulum(integrator="rk4"), {}, [0.0] * 30, start=[1.0, 0.5])
+    torch.testing.assert_close(out, on_time, rtol=1e-3, atol=5e-4)
 
 
 @pytest.mark.parametrize(

@@ -184,8 +184,13 @@ def test_estimated_states_come_with_rates():
     exact = torch.where(inputs.rollout == 0, 5 * torch.cos(5 * at), -5 * torch.sin(5 * at))
     torch.testing.assert_close(inputs.initial_rates[:, 0], exact, atol=2e-2, rtol=0)
     torch.testing.assert_close(inputs.initial_values, inputs.initial_readings, atol=1e-4, rtol=0)
+    assert inputs.is_zero is not None
+    is_first = inputs.start == 0
+    at_zero, at_rest = inputs.is_zero[..., 0].unbind(-1)
+    assert torch.equal(at_zero, is_first & (inputs.rollout == 0))
+    assert torch.equal(at_rest, is_first & (inputs.rollout == 1))
     recorded = rollouts.inputs(50, "recorded")
-    assert recorded.initial_rates is None
+    assert recorded.initial_rates is None and recorded.is_zero is None
     assert torch.equal(recorded.initial_values, recorded.initial_readings)
 
 

@@ -142,6 +142,7 @@ class EffectChain(ABC):
         commands_before: Callable[[int], Components] | None = None,
         num_past: int = 0,
         past_motion: PastMotion | None = None,
+        is_held: Tensor | None = None,
     ) -> State:
         """Returns the state at the start of an episode or segment.
 
@@ -159,6 +160,7 @@ class EffectChain(ABC):
             num_past: Steps before the start through which the caller will advance the action
                 effects.
             past_motion: Motion of the joints before the start; ``None`` if it is unknown.
+            is_held: Where the robot did not move before, ``(N,)``; ``None`` for nowhere.
         """
         earlier = time - num_past * self.time_step
         joint_positions, joint_velocities = positions, velocities
@@ -179,6 +181,7 @@ class EffectChain(ABC):
                 commands_before or (lambda _: commands),
                 readings,
                 time,
+                is_held,
             ),
         )
 
@@ -190,6 +193,7 @@ class EffectChain(ABC):
         commands_before: Callable[[int], Components],
         readings: tuple[Tensor | None, ...],
         time: Tensor,
+        is_held: Tensor | None,
     ) -> tuple[tuple[Any, ...], ...]:
         """Returns the sensor effects' own state at the start; see :meth:`start`."""
         # Only values that an effect needs are computed, because short simulations start often.
@@ -208,6 +212,11 @@ class EffectChain(ABC):
             changes = earlier_changes(
                 self.simulator, states, accelerations, self.time_step, num_before
             )
+            if is_held is not None:
+                changes = {
+                    column: tuple(change.where(~is_held, 0.0) for change in own)
+                    for column, own in changes.items()
+                }
         return self.sensors.initial_memory(true, changes, readings, tables, time)
 
     def advance(

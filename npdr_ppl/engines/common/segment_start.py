@@ -1,6 +1,6 @@
 """True initial states of segments: recorded values with the sensor effects removed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -25,12 +25,14 @@ class RecordedStart(NamedTuple):
         readings: Measurement of each sensor; ``None`` if it was not recorded.
         time: Seconds since the rollout began.
         is_derived: Whether each state component is the rate of a recorded position.
+        is_held: Whether the robot was held in its first pose until its rollout began.
     """
 
     states: Components
     readings: tuple[Tensor | None, ...]
     time: Tensor
     is_derived: tuple[bool, ...]
+    is_held: Tensor
 
     def part(self, first: int, last: int) -> "RecordedStart":
         """Returns the data of some of the N simulations."""
@@ -39,6 +41,7 @@ class RecordedStart(NamedTuple):
             tuple(None if value is None else value[first:last] for value in self.readings),
             self.time[first:last],
             self.is_derived,
+            self.is_held[first:last],
         )
 
 
@@ -64,7 +67,32 @@ def recorded_start(simulator: Simulator, inputs: Inputs, shape: torch.Size) -> R
         ),
         spread(inputs.start.to(inputs.initial_values) * inputs.time_step),
         tuple(has_rates and state.rate_of in columns for state in simulator.states),
+        spread(_is_held(simulator, inputs, columns)),
     )
+
+
+def _is_held(simulator: Simulator, inputs: Inputs, columns: Mapping[str, int]) -> Tensor:
+    """Returns which segments begin a rollout at rest, a mask that broadcasts to ``(…, S)``.
+
+    Nothing moves at the first sample, so something held the robot until then, or it was in
+    equilibrium, where both are the same. Otherwise it moved before, under the same laws.
+    """
+    held = inputs.start == 0
+    if inputs.is_zero is None:
+        starts = zip(simulator.states, simulator.initial_states(inputs), strict=True)
+        for state, value in starts:
+            if state.rate_of is not None:
+                held = held & (value == 0.0)
+        return held
+    value, rate = inputs.is_zero.unbind(-2)
+    for state in simulator.states:
+        if state.rate_of is None:
+            continue
+        if state.rate_of in columns:
+            held = held & rate[..., columns[state.rate_of]]
+        if state.name in columns:
+            held = held & value[..., columns[state.name]]
+    return held
 
 
 def true_start(
@@ -76,7 +104,8 @@ def true_start(
     """Returns the true state, computed from recorded values by removing the sensor effects.
 
     A velocity that was derived from position measurements has the scale and timing of the position
-    sensor. It does not have the offset or scale of the velocity sensor.
+    sensor. It does not have the offset or scale of the velocity sensor. Where the robot was held
+    until its rollout began, late measurements show the same pose.
 
     Args:
         chain: The effects.
@@ -105,6 +134,7 @@ def true_start(
                 value = torch.where(recorded.time == 0.0, value, rate)
             true[i] = value
     leads = sensor_leads(chain.sensors.effects, tables.effects, recorded.time)
+    leads = {column: lead.where(~recorded.is_held, 0.0) for column, lead in leads.items()}
     if not leads:
         return tuple(true)
     sources = (

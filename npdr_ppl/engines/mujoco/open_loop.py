@@ -132,6 +132,7 @@ class _Replay:
                 commands_before=partial(commands_at, records),
                 num_past=past,
                 past_motion=self._past_motion(chain).part(first, last),
+                is_held=recorded.is_held,
             )
             servo_memory = with_recorded_past(
                 self.simulator,

@@ -214,5 +214,6 @@ def _start(
         commands_before=partial(commands_at, records),
         num_past=past,
         past_motion=past_motion(inputs, stepper.channels_with_past, shape, recorded.time.dtype),
+        is_held=recorded.is_held,
     )
     return with_past_commands(stepper, state, tables, records, past)
