@@ -6,8 +6,9 @@
     python benchmarks/learning.py --summary outside.jsonl
 
 The rigs and their recordings are those of :mod:`discovery`. Settings are chosen with
-``--part tune``, whose seeds are not those that are reported. The floor of the held-out misfit is
-that of the same rig with the same noise and nothing hidden. With ``--whole``, a row is the result
+``--part tune``, whose seeds are not those that are reported. The misfit on the other excitation is
+the mean over several recordings, because the noise of one makes it uncertain by a twentieth; its
+floor is the same of the same rig with nothing hidden. With ``--whole``, a row is the result
 of ``npdr discover --learn``; without it, laws are learned from the fitted original model.
 """
 
@@ -22,10 +23,10 @@ from typing import Any
 
 import torch
 from discovery import SEEDS, Task, _case, _catalogue, tasks
-from hidden_rigs import RIGS, Case, make_case
+from hidden_rigs import RIGS, Case, hold_out_again, make_case
 from hidden_rigs.force_laws import FORCE_LAWS
 from hidden_rigs.friction_laws import DRY_LAWS
-from learning_rivals import rival_misfits
+from learning_rivals import rival_models
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import Hypothesis
@@ -37,6 +38,9 @@ from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.segment_options import segment_options, short_segments
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
+
+NUM_ELSEWHERE = 4
+"""Recordings of the other excitation whose misfits are averaged."""
 
 
 def judge(task: Task, is_whole: bool) -> dict[str, Any]:
@@ -72,25 +76,38 @@ def judge(task: Task, is_whole: bool) -> dict[str, Any]:
 
 def _described(case: Case, learned: LearnedModel) -> dict[str, Any]:
     same = DataOptions(segment_length=learned.start.segments.inputs.num_steps)
-    options = segment_options(case.holdout, same)
     null = make_case(case.rig, "null", (), seed=case.seed)
     searcher = Searcher(null.model, null.fit, npdr.DiscoveryOptions(), data_options=same)
     quiet = searcher.settled(searcher.fit_base(may_be_rough=True))
-    scale = quiet.fit.scale
-    along = SegmentModel(learned.start.model, case.holdout, options)
-    before, after = (misfit(h, along, scale) for h in (learned.start, learned.hypothesis))
-    floor = misfit(quiet, SegmentModel(quiet.model, null.holdout, options), scale)
+    models = {"before": learned.start, "after": learned.hypothesis}
+    models |= rival_models(learned.start, case.fit)
+    misfits = {name: _misfit_elsewhere(h, case, quiet) for name, h in models.items()}
+    before, after = misfits.pop("before"), misfits.pop("after")
+    floor = _misfit_elsewhere(quiet, null, quiet)
     return {
         "laws": [f"{law.port.name}: {law.formula_with_numbers}" for law in learned.laws],
         "before": before,
         "after": after,
         "floor": floor,
         "closed": (before - after) / (before - floor),
-        "checks": [c.to_dict() for c in checks(learned, case.holdout, options)],
-        "rivals": rival_misfits(learned.start, case.fit, along, scale),
+        "checks": [
+            c.to_dict() for c in checks(learned, case.holdout, segment_options(case.holdout, same))
+        ],
+        "rivals": misfits,
         "force_error": _force_error(case, learned),
         "closed_on_fit": _closed_on_fit(learned, quiet),
     }
+
+
+def _misfit_elsewhere(hypothesis: Hypothesis, case: Case, quiet: Hypothesis) -> float:
+    """Returns a model's mean misfit along recordings of the other excitation."""
+    same = DataOptions(segment_length=hypothesis.segments.inputs.num_steps)
+    found = []
+    for number in range(NUM_ELSEWHERE):
+        recorded = hold_out_again(case, seed=100 * case.seed + number)
+        along = SegmentModel(hypothesis.model, recorded, segment_options(recorded, same))
+        found.append(misfit(hypothesis, along, quiet.fit.scale))
+    return statistics.fmean(found)
 
 
 def _closed_on_fit(learned: LearnedModel, quiet: Hypothesis) -> float:

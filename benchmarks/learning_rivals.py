@@ -25,16 +25,14 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.learning.proof import misfit
 from npdr_ppl.discovery.learning.recorded_motion import motion_at_ports
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Joint
 from npdr_ppl.language.effects import ForceEffect
 from npdr_ppl.language.handlers import add_effect
-from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["rival_misfits"]
+__all__ = ["rival_models"]
 
 MOST_SAMPLES = 800
 """Samples of a Gaussian process: its cost grows with their cube."""
@@ -70,16 +68,12 @@ class _Residual(ForceEffect):
         return memory
 
 
-def rival_misfits(
-    start: Hypothesis, recorded: Rollouts, along: SegmentModel, scale: Tensor
-) -> dict[str, float]:
-    """Returns the misfit along other segments with each residual force.
+def rival_models(start: Hypothesis, recorded: Rollouts) -> dict[str, Hypothesis]:
+    """Returns the model with each residual force, by the name of the method.
 
     Args:
         start: The model, its parameters fitted.
         recorded: The recording.
-        along: The model along the other segments.
-        scale: Standard deviation of each channel.
     """
     found = residual_forces(start, recorded)
     forces = found.filtered(found.forces)
@@ -99,8 +93,7 @@ def rival_misfits(
         law = fit(columns, forces[:, joint], port.coordinate == "rad")
         model = add_effect(start.model, _Residual(port.name, law))
         z = torch.cat((start.fit.z, torch.zeros(1, dtype=torch.float64)))
-        hypothesis = Hypothesis(model, start.effects, start.segments, replace(start.fit, z=z))
-        result[name] = misfit(hypothesis, along, scale)
+        result[name] = Hypothesis(model, start.effects, start.segments, replace(start.fit, z=z))
     return result
 
 

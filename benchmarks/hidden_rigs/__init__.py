@@ -10,7 +10,16 @@ in NumPy and in other forms than the package's. Nothing in here imports the pack
 effects but :mod:`hidden_rigs.under_test`, which holds the models to be judged.
 """
 
-from hidden_rigs.cases import CONDITIONS, Case, Condition, cases, make_case, places, play
+from hidden_rigs.cases import (
+    CONDITIONS,
+    Case,
+    Condition,
+    cases,
+    hold_out_again,
+    make_case,
+    places,
+    play,
+)
 from hidden_rigs.hidden import Hidden
 from hidden_rigs.rig import Place
 from hidden_rigs.rigs import RIGS
@@ -23,6 +32,7 @@ __all__ = [
     "Hidden",
     "Place",
     "cases",
+    "hold_out_again",
     "make_case",
     "places",
     "play",

@@ -20,7 +20,16 @@ from npdr_ppl.errors import ModelError
 from npdr_ppl.randomness import derived_seed
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["CONDITIONS", "Case", "Condition", "cases", "make_case", "places", "play"]
+__all__ = [
+    "CONDITIONS",
+    "Case",
+    "Condition",
+    "cases",
+    "hold_out_again",
+    "make_case",
+    "places",
+    "play",
+]
 
 Condition = Literal[
     "null",
@@ -246,6 +255,25 @@ def play(
         measurement=rig.measurement,
         seed=derived_seed(seed, case.rig, "played"),
         played=(commands, start[: len(rig.layout.positions)]),
+    ).rollouts
+
+
+def hold_out_again(case: Case, *, seed: int) -> Rollouts:
+    """Records excitations of the held-out kind once more, from other starts and with other noise.
+
+    Args:
+        case: The case; its parameters and what is hidden stay.
+        seed: Seed of excitations, starts and noise.
+    """
+    rig = _rig(case.rig)
+    recorder = record_in_mujoco if rig.engine == "mujoco" else record
+    return recorder(
+        rig,
+        HOLDOUT_EXCITATIONS,
+        parameters=case.parameters,
+        hidden=case.truth,
+        measurement=rig.measurement,
+        seed=derived_seed(seed, case.rig, "held out again"),
     ).rollouts
 
 
