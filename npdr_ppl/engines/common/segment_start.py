@@ -88,10 +88,11 @@ def _is_held(simulator: Simulator, inputs: Inputs, columns: Mapping[str, int]) -
     for state in simulator.states:
         if state.rate_of is None:
             continue
-        if state.rate_of in columns:
-            held = held & rate[..., columns[state.rate_of]]
+        # A measured velocity is more accurate than one from later positions.
         if state.name in columns:
             held = held & value[..., columns[state.name]]
+        elif state.rate_of in columns:
+            held = held & rate[..., columns[state.rate_of]]
     return held
 
 
