@@ -240,6 +240,7 @@ class Investigation:
             self._data_options,
             seed=self.seed,
             progress=self.progress,
+            is_approximate=self.search.is_approximate,
         )
 
     @cached_property

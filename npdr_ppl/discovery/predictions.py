@@ -32,6 +32,7 @@ class Predictions:
         options: How the recording that was searched is prepared.
         seed: Seed of everything random.
         progress: Shows the stages, and records how long they take.
+        is_approximate: Whether the revised model leaves something unexplained.
     """
 
     def __init__(
@@ -44,14 +45,17 @@ class Predictions:
         *,
         seed: int,
         progress: SearchProgress,
+        is_approximate: bool = False,
     ) -> None:
         self._given = given
-        self._revised = revised
         self._rollouts = rollouts
         self._holdout = holdout
         self._options = options
         self._seed = seed
         self._progress = progress
+        # A model that lacks effects predicts; its intervals are wrong.
+        self._lacks_effects = [given] if given is not revised else []
+        self._lacks_effects += [revised] if is_approximate else []
         self._drawn: list[tuple[Hypothesis, Draws]] = []
         self._anew: list[tuple[Hypothesis, EstimatedAnew | None]] = []
 
@@ -62,8 +66,7 @@ class Predictions:
                 return draws
         with self._progress.timed(f"posterior {len(self._drawn) + 1}"):
             self._progress.say("drawing parameters")
-            # The original model predicts; where it lacks effects, its intervals are wrong.
-            is_rough = hypothesis is self._given and hypothesis is not self._revised
+            is_rough = any(hypothesis is one for one in self._lacks_effects)
             draws = posterior_draws(hypothesis, seed=self._seed, is_rough=is_rough)
         self._drawn.append((hypothesis, draws))
         return draws

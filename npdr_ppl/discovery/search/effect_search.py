@@ -259,6 +259,7 @@ class Searcher:
             # As long as something remains that no law explains, the laws are approximations.
             is_approximate = is_something_left(rounds[0], self._looked(current, rounds))
             candidates = candidates_at(base, self.options)
+            self._report("seeing whether simpler laws, or fewer, explain as much")
             if is_approximate:
                 current = simplest_laws(base, current, candidates, self.trials, self._report)
             else:
