@@ -1,6 +1,7 @@
 """The examples run, at a size that a test can afford."""
 
 import importlib.util
+import json
 import runpy
 from pathlib import Path
 
@@ -98,6 +99,22 @@ def test_a_servo_of_the_gallery_follows_its_goal(name, signal):
     sag = trajectory[..., 0].flatten().numpy()[100:] - late[-trajectory.shape[-2] :][100:]
     weight = 0.117 if name == "wrist_pitch" else 0.0
     assert np.abs(sag - weight / 10.5 * np.cos(late[-len(sag) :])).max() < 0.001
+
+
+def test_the_servo_with_a_pendulum_reads_its_log_and_sags_under_its_weight(tmp_path, monkeypatch):
+    time = 0.005 * np.arange(3000)
+    entry = {"position": 0.3, "speed": 0.0, "goal_position": 0.5}
+    log = {"motor": "xl330", "kp": 400, "trajectory": "hold"}
+    log["entries"] = [{**entry, "timestamp": float(t)} for t in time]
+    (tmp_path / "log.json").write_text(json.dumps(log))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["bam_to_csv.py", "log.json"])
+    gallery = EXAMPLES / "gallery"
+    runpy.run_path(str(gallery / "bam_to_csv.py"))
+    rollouts = npdr.Rollouts.load("xl330_kp400_hold.csv", gallery / "xl330.toml")
+    robot = npdr.MujocoSimulator(gallery / "xl330.xml", time_step=rollouts.time_step)
+    angle = float(robot.simulate({}, rollouts.inputs(None, "recorded"))[0, -1, 0])
+    assert 1.0 * (0.5 - angle) == pytest.approx(0.49 * 9.81 * 0.1 * np.sin(angle), abs=1e-4)
 
 
 LINKS = "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"
