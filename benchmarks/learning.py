@@ -7,9 +7,9 @@
 
 The rigs and their recordings are those of :mod:`discovery`. Settings are chosen with
 ``--part tune``, whose seeds are not those that are reported. The misfit on the other excitation is
-the mean over several recordings, because the noise of one makes it uncertain by a twentieth; its
-floor is the same of the same rig with nothing hidden. With ``--whole``, a row is the result
-of ``npdr discover --learn``; without it, laws are learned from the fitted original model.
+the mean over several recordings, because noise changes that of one by 5 %. The floor is this mean
+for the same rig with nothing hidden. With ``--whole``, a row is the result of
+``npdr discover --learn``; without it, laws are learned from the fitted original model.
 """
 
 import argparse

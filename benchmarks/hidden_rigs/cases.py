@@ -261,6 +261,8 @@ def play(
 def hold_out_again(case: Case, *, seed: int) -> Rollouts:
     """Records excitations of the held-out kind once more, from other starts and with other noise.
 
+    The noise is the rig's own, also where the case has another one.
+
     Args:
         case: The case; its parameters and what is hidden stay.
         seed: Seed of excitations, starts and noise.

@@ -52,10 +52,12 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
         for values in found["starts"]
     ]
     if len(set(starts)) == 1:
-        console.print(f"Start at rest at {escape(starts[0])}.", highlight=False)
+        console.print(f"Hold it at rest at {escape(starts[0])} first.", highlight=False)
     else:
         for index, start in enumerate(starts):
-            console.print(f"Start rollout {index} at rest at {escape(start)}.", highlight=False)
+            console.print(
+                f"Hold it at rest at {escape(start)} before rollout {index}.", highlight=False
+            )
     if found["has_stopped"]:
         console.print("The time limit ended the search; a longer --search-time may find more.")
     rollouts = f"{found['rollouts']} rollouts of " if found["rollouts"] > 1 else ""

@@ -45,7 +45,7 @@ class Predictions:
         *,
         seed: int,
         progress: SearchProgress,
-        is_approximate: bool = False,
+        is_approximate: bool,
     ) -> None:
         self._given = given
         self._rollouts = rollouts

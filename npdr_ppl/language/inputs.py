@@ -18,7 +18,7 @@ _STARTS = (
     "initial_rate_errors",
 )
 
-_MEASUREMENTS = "is_read", "lateness", "is_zero"
+_UNBATCHED = "is_read", "lateness", "is_zero"
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Inputs:
             no recording, or if they would take more than 32 MiB.
         recorded_readings: Measurements before each step of whole rollouts, ``(R, T, C)``; forces
             and servos that depend on past motion need them. ``None`` likewise.
-        is_zero: Whether the value, then the rate, of each channel is zero within its error at the
-            first sample of a rollout, ``(S, 2, C)``; false for other segments. ``None`` if
-            recorded states are assumed to be exact.
+        is_zero: Whether the value, then the rate, of each channel is zero within two standard
+            deviations of its error at the first sample of a rollout, ``(S, 2, C)``; false for
+            other segments. ``None`` if the initial values say so exactly.
     """
 
     actions: Tensor
@@ -109,6 +109,9 @@ class Inputs:
             value = getattr(self, name)
             if value is not None:
                 expected[name] = ((*value.shape[:2], len(columns)), tuple(value.shape))
+        if self.is_zero is not None:
+            shape = (segments, 2, len(self.channel_names))
+            expected["is_zero"] = (shape, tuple(self.is_zero.shape))
         for name, (want, got) in expected.items():
             if want != got and tuple(want) != tuple(got):
                 raise ShapeError(f"Inputs.{name} should have shape {want}, got {got}.")
@@ -213,7 +216,7 @@ class Inputs:
             **self._starts(lambda value: value[..., index, :]),
             actions=self.actions[..., index, :, :],
             past_actions=self.past_actions[..., index, :, :],
-            **self._sampling(lambda value: value[index]),
+            **self._unbatched(lambda value: value[index]),
             mask=self.mask[index],
             rollout=self.rollout[index],
             start=self.start[index],
@@ -225,7 +228,7 @@ class Inputs:
         return replace(
             self,
             **self._starts(lambda value: value[..., columns]),
-            **self._sampling(lambda value: value[..., columns]),
+            **self._unbatched(lambda value: value[..., columns]),
             recorded_readings=None
             if self.recorded_readings is None
             else self.recorded_readings[..., columns],
@@ -309,9 +312,9 @@ class Inputs:
             moved = moved + weight * around
         return torch.where(late == 0.0, trajectory, moved)
 
-    def _sampling(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
-        """Applies a function to the fields ``(S, …, C)`` of measurements that are not ``None``."""
-        values = {name: getattr(self, name) for name in _MEASUREMENTS}
+    def _unbatched(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        """Applies a function to the unbatched fields ``(S, …, C)`` that are not ``None``."""
+        values = {name: getattr(self, name) for name in _UNBATCHED}
         return {name: change(value) for name, value in values.items() if value is not None}
 
     def _starts(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:

@@ -118,16 +118,16 @@ def cut(
         mask[row, : stop - start] = True
         readings[row] = rollouts.readings[rollout][start]
     starts: dict[str, NDArray[np.float64]] = {"initial_values": readings}
+    is_zero = np.stack((readings == 0.0, np.zeros_like(readings, dtype=bool)), axis=1)
     if initial_state != "recorded":
         estimate = _estimated(rollouts, layout)
         starts = {"initial_values": estimate.values, "initial_rates": estimate.rates}
         if initial_state == "uncertain":
             starts["initial_value_errors"] = estimate.value_errors
             starts["initial_rate_errors"] = estimate.rate_errors
-    sampling: dict[str, Tensor] = {}
-    if initial_state != "recorded":
-        is_first = np.array([start == 0 for _, start, _ in layout])
-        sampling["is_zero"] = torch.tensor(estimate.is_zero & is_first[:, None, None])
+        is_zero = estimate.is_zero
+    is_first = np.array([start == 0 for _, start, _ in layout])[:, None, None]
+    sampling = {"is_zero": torch.tensor(is_zero & is_first)}
     if rollouts.samplings:
         sampling |= {
             "is_read": torch.tensor(_compared(rollouts, layout, num_steps)),

@@ -69,10 +69,12 @@ class StateEstimate:
 
     @property
     def is_zero(self) -> NDArray[np.bool_]:
-        """Whether values, then rates, are zero within their errors, ``(P, 2, C)``."""
-        values = np.stack((self.values, self.rates), axis=1)
-        errors = np.stack((self.value_errors, self.rate_errors), axis=1)
-        return np.asarray(abs(values) <= CONFIDENCE * errors)
+        """Whether values, then rates, are zero within two errors, ``(P, 2, C)``."""
+        # The rate of a constant is not zero but rounding, and has no error.
+        rounding = NEGLIGIBLE * abs(self.values)
+        is_value_zero = abs(self.values) <= CONFIDENCE * self.value_errors
+        is_rate_zero = abs(self.rates) <= CONFIDENCE * self.rate_errors + rounding
+        return np.stack((is_value_zero, is_rate_zero), axis=1)
 
 
 def estimate_states(

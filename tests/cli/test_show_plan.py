@@ -34,7 +34,7 @@ def test_a_plan_that_suffices_says_how_probably(capsys, tmp_path):
     assert "name the right cause in 97% of such cases, and a wrong one in 1%" in text
     assert "with random commands the right one in 40%" in text
     assert "are needed" not in text and "do not suffice" not in text
-    assert "Start at rest at angle 0." in text and "for 5 s are in" in text
+    assert "Hold it at rest at angle 0 first." in text and "for 5 s are in" in text
 
 
 @pytest.mark.parametrize(
@@ -58,6 +58,6 @@ def test_a_plan_that_does_not_suffice_says_what_would(outlook, sentence, capsys,
 
 def test_starts_that_differ_are_told_one_by_one(capsys, tmp_path):
     text = told(capsys, tmp_path, starts=({"angle": 0.0}, {"angle": 1.5}))
-    assert "Start rollout 0 at rest at angle 0." in text
-    assert "Start rollout 1 at rest at angle 1.5." in text
+    assert "Hold it at rest at angle 0 before rollout 0." in text
+    assert "Hold it at rest at angle 1.5 before rollout 1." in text
     assert "for 2 rollouts of 5 s are in" in text

@@ -151,6 +151,17 @@ def test_late_sensors_show_a_robot_that_is_released_from_rest_where_it_was_held(
     )
 
 
+def test_late_sensors_show_an_episodes_first_pose_until_their_delay_has_passed():
+    simulator = Pendulum().with_effects(SensorDelay("angle,velocity"))
+    given = {"angle,velocity.sensor_delay.delay": torch.tensor(0.0207, dtype=torch.float64)}
+    policy = Linear(("angle", "velocity"), ("torque",))
+    policy.parameters = torch.zeros_like(policy.parameters).double()
+    start = torch.tensor([[1.0, 0.0], [1.0, 0.5]], dtype=torch.float64)
+    episodes = simulator.roll_out(given, policy, start, 10, record=True)
+    held, moving = episodes.readings[:, 1, 1].tolist()
+    assert held == 0.0 and abs(moving - 0.5) > 0.005
+
+
 def test_a_robot_that_begins_in_motion_moved_before():
     simulator = Pendulum(integrator="rk4").with_effects(SensorDelay("angle,velocity"))
     given = {"angle,velocity.sensor_delay.delay": 0.01}

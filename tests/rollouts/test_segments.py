@@ -190,8 +190,20 @@ def test_estimated_states_come_with_rates():
     assert torch.equal(at_zero, is_first & (inputs.rollout == 0))
     assert torch.equal(at_rest, is_first & (inputs.rollout == 1))
     recorded = rollouts.inputs(50, "recorded")
-    assert recorded.initial_rates is None and recorded.is_zero is None
+    assert recorded.initial_rates is None and recorded.is_zero is not None
+    assert torch.equal(recorded.is_zero[..., 0, 0], at_zero)
     assert torch.equal(recorded.initial_values, recorded.initial_readings)
+
+
+def test_a_joint_that_never_moves_begins_at_rest():
+    time = 0.01 * np.arange(201)
+    still = np.full_like(time, 0.3)
+    rollouts = Rollouts.from_arrays(
+        [np.stack((np.sin(5 * time), still), axis=-1)],
+        channel_names=("moving", "still"),
+        time_step=0.01,
+    )
+    assert rollouts.inputs(50).is_zero[0].tolist() == [[True, False], [False, True]]
 
 
 @pytest.mark.parametrize(

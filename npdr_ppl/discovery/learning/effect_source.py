@@ -23,8 +23,8 @@ from npdr_ppl.python_text import plain, quoted
 __all__ = ["class_source", "module_source"]
 
 SLOPE_STEP = 1e-5
-"""Step of the central difference of a sensor's error, rad or m: far below the shortest waves that
-are learned, and far above rounding."""
+"""Step of the central difference of a sensor's error, rad or m. It is far below the shortest waves
+that are learned, and far above rounding in double precision."""
 
 _BASES = {
     "force": "ForceEffect",

@@ -170,6 +170,7 @@ def _made(
         rollout=torch.arange(len(commands)),
         start=torch.zeros(len(commands), dtype=torch.long),
         initial_rates=torch.zeros_like(start),
+        is_zero=torch.ones(len(commands), 2, start.shape[-1], dtype=torch.bool),
     )
     columns = [segments.sensor_names.index(name) for name in segments.channel_names]
     box = segments.black_box(hypothesis.fit.z[None])

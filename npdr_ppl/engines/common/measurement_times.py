@@ -3,7 +3,8 @@
 A segment starts from measured states. If a sensor lags by d, it shows the state of d seconds ago,
 which is advanced by d under the recorded commands. During the first d seconds of the segment, such
 a sensor still reports values from before the segment. States are moved in time with the
-simulator's own accelerations at the middle of each time span, without effects.
+simulator's own accelerations at the middle of each time span, without effects. A robot at rest at
+a rollout's first sample counts as held there before, so that nothing is moved.
 """
 
 import math

@@ -138,7 +138,12 @@ def begin(body: LoopBody, states: Components, tables: Tables, constants: Any) ->
         for k in goals:
             lower, upper = body.limits[k]
             before[k] = chosen[body.order[k]].clamp(lower, upper).expand_as(zero)
-    state = body.stepper.start(positions, velocities, tables, tuple(before), no_readings, zero)
+    is_held = zero == 0.0
+    for velocity in velocities:
+        is_held = is_held & (velocity == 0.0)
+    state = body.stepper.start(
+        positions, velocities, tables, tuple(before), no_readings, zero, is_held=is_held
+    )
     return PolicyLoop(state, readings, memory, torch.ones_like(zero, dtype=torch.bool), zero, zero)
 
 

@@ -1,6 +1,6 @@
 """True initial states of segments: recorded values with the sensor effects removed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -25,6 +25,7 @@ class RecordedStart(NamedTuple):
         readings: Measurement of each sensor; ``None`` if it was not recorded.
         time: Seconds since the rollout began.
         is_derived: Whether each state component is the rate of a recorded position.
+        is_recorded: Whether each state component was recorded itself.
         is_held: Whether the robot was held in its first pose until its rollout began.
     """
 
@@ -32,6 +33,7 @@ class RecordedStart(NamedTuple):
     readings: tuple[Tensor | None, ...]
     time: Tensor
     is_derived: tuple[bool, ...]
+    is_recorded: tuple[bool, ...]
     is_held: Tensor
 
     def part(self, first: int, last: int) -> "RecordedStart":
@@ -41,6 +43,7 @@ class RecordedStart(NamedTuple):
             tuple(None if value is None else value[first:last] for value in self.readings),
             self.time[first:last],
             self.is_derived,
+            self.is_recorded,
             self.is_held[first:last],
         )
 
@@ -58,41 +61,46 @@ def recorded_start(simulator: Simulator, inputs: Inputs, shape: torch.Size) -> R
         return value.expand(shape).reshape(-1)
 
     columns = {name: i for i, name in enumerate(inputs.channel_names)}
-    has_rates = inputs.initial_rates is not None
+    has_rates, states = inputs.initial_rates is not None, simulator.initial_states(inputs)
     return RecordedStart(
-        tuple(spread(value) for value in simulator.initial_states(inputs)),
+        tuple(spread(value) for value in states),
         tuple(
             spread(inputs.initial_readings[..., columns[s.name]]) if s.name in columns else None
             for s in simulator.sensors
         ),
         spread(inputs.start.to(inputs.initial_values) * inputs.time_step),
         tuple(has_rates and state.rate_of in columns for state in simulator.states),
-        spread(_is_held(simulator, inputs, columns)),
+        tuple(state.name in columns for state in simulator.states),
+        spread(_is_held(simulator, inputs, states)),
     )
 
 
-def _is_held(simulator: Simulator, inputs: Inputs, columns: Mapping[str, int]) -> Tensor:
+def _is_held(simulator: Simulator, inputs: Inputs, states: Sequence[Tensor]) -> Tensor:
     """Returns which segments begin a rollout at rest, a mask that broadcasts to ``(…, S)``.
 
-    Nothing moves at the first sample, so something held the robot until then, or it was in
-    equilibrium, where both are the same. Otherwise it moved before, under the same laws.
+    If nothing moves at the first sample, something held the robot until then, or it was in
+    equilibrium, where both are the same. Otherwise it moved before, under the same laws. A
+    recording that begins where a motion turns back is taken for the first.
+
+    Args:
+        simulator: The simulator.
+        inputs: The segments.
+        states: Its state at their start.
     """
-    held = inputs.start == 0
-    if inputs.is_zero is None:
-        starts = zip(simulator.states, simulator.initial_states(inputs), strict=True)
-        for state, value in starts:
-            if state.rate_of is not None:
-                held = held & (value == 0.0)
-        return held
-    value, rate = inputs.is_zero.unbind(-2)
-    for state in simulator.states:
-        if state.rate_of is None:
+    columns = {name: i for i, name in enumerate(inputs.channel_names)}
+    held = (inputs.start == 0).to(inputs.initial_values.device)
+    for state, is_rate, speed in zip(simulator.states, simulator.is_rate, states, strict=True):
+        if not is_rate:
             continue
         # A measured velocity is more accurate than one from later positions.
-        if state.name in columns:
-            held = held & value[..., columns[state.name]]
+        if inputs.is_zero is None:
+            held = held & (speed == 0.0)
+        elif state.name in columns:
+            held = held & inputs.is_zero[..., 0, columns[state.name]]
         elif state.rate_of in columns:
-            held = held & rate[..., columns[state.rate_of]]
+            held = held & inputs.is_zero[..., 1, columns[state.rate_of]]
+        else:
+            held = torch.zeros_like(held)
     return held
 
 
@@ -132,7 +140,8 @@ def true_start(
                     rate = effect.initial_rate(rate, here, tables.effects[place])
                 # At the first sample of a rollout, measured velocities are used; see
                 # Simulator.initial_states.
-                value = torch.where(recorded.time == 0.0, value, rate)
+                is_measured = (recorded.time == 0.0) & recorded.is_recorded[i]
+                value = torch.where(is_measured, value, rate)
             true[i] = value
     leads = sensor_leads(chain.sensors.effects, tables.effects, recorded.time)
     leads = {column: lead.where(~recorded.is_held, 0.0) for column, lead in leads.items()}

@@ -129,15 +129,7 @@ class Signals:
         if not chain.sensors.effects:
             return values
         tables = Tables(self._true_at_start(values, initial_states), effects)
-        state = chain.start(
-            (),
-            (),
-            tables,
-            (),
-            self._recorded.readings,
-            self.start_times,
-            is_held=self._recorded.is_held,
-        )
+        state = chain.start((), (), tables, (), self._recorded.readings, self.start_times)
         steps = []
         for present in values.unbind(-2):
             state, read = chain.sensors.report(state, present.unbind(-1), tables)

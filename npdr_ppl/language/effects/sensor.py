@@ -71,7 +71,7 @@ class SensorEffect(Effect):
         """Returns by how many seconds measurements lead the true values; ``None`` for zero.
 
         A delay is negative. The initial state of a segment is moved forward in time by the delay
-        of its measurement.
+        of its measurement, unless the robot was held until its rollout began.
 
         Args:
             parameters: The effect's parameters by short name.
