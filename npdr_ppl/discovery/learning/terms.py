@@ -162,7 +162,7 @@ def _static_terms(motion: PortMotion, name: str) -> Iterator[Term]:
             motion,
             "past",
             f"{name} - torch.clamp({name}, -{{0}}, {{0}})",
-            f"{name} − clip({name}, ±{{0}})",
+            f"({name} − clip({name}, ±{{0}}))",
             edge,
         )
         yield _shaped(
@@ -295,7 +295,7 @@ def _stops(motion: PortMotion) -> Iterator[Term]:
         if size <= 0.0:
             continue
         edge = Shape("edge", size, unit)
-        yield _shaped(motion, "stop", "q - torch.clamp(q, -{0}, {0})", "q − clip(q, ±{0})", edge)
+        yield _shaped(motion, "stop", "q - torch.clamp(q, -{0}, {0})", "(q − clip(q, ±{0}))", edge)
         yield Term(
             f"damped stop {size:.6g}",
             ("q - torch.clamp(q, -edge, edge)", "v * (torch.abs(q) > edge)"),

@@ -115,6 +115,17 @@ def test_terms_have_unique_names_and_costs_that_count_their_columns():
         assert all(term.cost >= len(term.columns) for term in terms)
 
 
+@pytest.mark.parametrize("motion", [JOINT, COMMAND, SENSOR])
+def test_a_coefficient_multiplies_the_whole_formula_behind_it(motion):
+    for term in terms_at(motion):
+        for formula in () if term.is_spline else term.formulas:
+            outside, depth = "", 0
+            for letter in formula:
+                depth += (letter == "(") - (letter == ")")
+                outside += letter if depth == 0 else ""
+            assert not re.search(" [+−] ", outside), formula
+
+
 def test_a_file_says_the_law_its_units_and_where_it_was_learned():
     term = next(t for t in terms_at(JOINT) if t.key == "v³")
     source = module_source([law_with(JOINT, term)], "From a test.")
