@@ -15,6 +15,7 @@ from npdr_ppl.models.effects import (
     Bias,
     CoulombFriction,
     EncoderBias,
+    EncoderScale,
     InputDelay,
     ParameterDrift,
     SensorLowPass,
@@ -25,6 +26,7 @@ from npdr_ppl.models.emps import Emps
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.models.pendulum import Pendulum
 from tests.helpers.effect_recovery import Recovery
+from tests.helpers.effect_replay import FREE, replay
 
 SIMULATORS = (Pendulum, Furuta, CartPole, Emps)
 
@@ -178,6 +180,14 @@ def test_effects_compose_in_the_order_of_attachment():
     for order in ((gain, delay, lag), (gain, lag, delay), (lag, gain, delay)):
         out = Furuta().with_effects(*order).simulate(strengths, inputs)
         torch.testing.assert_close(out[0], expected[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("order", [(EncoderBias, EncoderScale), (EncoderScale, EncoderBias)])
+def test_several_errors_of_a_sensor_are_removed_from_a_start_in_reverse_order(order):
+    wrong = Emps().with_effects(*(effect("position") for effect in order))
+    errors = {"position.encoder_bias.offset": 0.1, "position.encoder_scale.error": 0.5}
+    out = replay(wrong, FREE | errors, [0.0] * 5, start=[0.3, 0.0])
+    torch.testing.assert_close(out[:, 0], torch.full_like(out[:, 0], 0.3), rtol=0.0, atol=1e-12)
 
 
 def test_all_kinds_at_once_reduce_to_the_base_at_zero_strength():

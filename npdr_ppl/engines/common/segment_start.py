@@ -128,7 +128,8 @@ def true_start(
     places = {state.name: i for i, state in enumerate(states)}
     sensors = {sensor.name: i for i, sensor in enumerate(chain.simulator.sensors)}
     true = list(recorded.states)
-    for place, effect, columns in chain.sensors.effects:
+    # The last effect changed the measurement last, so it is removed first.
+    for place, effect, columns in reversed(chain.sensors.effects):
         for i, state in enumerate(states):
             value = true[i]
             if sensors.get(state.name) in columns:
