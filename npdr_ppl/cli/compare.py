@@ -9,6 +9,7 @@ from npdr_ppl.cli.options import (
     DeviceOption,
     EffectOption,
     EmbeddingOption,
+    HoldoutDataOption,
     HoldoutOption,
     InitialState,
     InitialStateOption,
@@ -47,6 +48,7 @@ def compare(
     seed: SeedOption = 0,
     mapping: MappingOption = None,
     holdout: HoldoutOption = "",
+    holdout_data: HoldoutDataOption = None,
     effect: EffectOption = None,
     embedding: EmbeddingOption = "score",
     segment_length: SegmentLengthOption = "auto",
@@ -87,7 +89,7 @@ def compare(
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     options = data_options(embedding, segment_length, initial_state, precision, noise, strict)
-    train, test = resolve_rollouts(data, holdout, mapping)
+    train, test = resolve_rollouts(data, holdout, holdout_data, mapping)
     with (
         resumable(f"the same command again continues the comparison in {out}."),
         reporter(False if quiet else None) as report,

@@ -1,7 +1,6 @@
 """`npdr discover`: finds effects that a model lacks, adds them and tests them."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,6 +10,7 @@ from npdr_ppl.cli.names import complete_effect
 from npdr_ppl.cli.options import (
     DataOption,
     EffectOption,
+    HoldoutDataOption,
     HoldoutOption,
     InitialState,
     InitialStateOption,
@@ -60,10 +60,7 @@ def discover(
     out: OutOption,
     mapping: MappingOption = None,
     holdout: HoldoutOption = "",
-    holdout_data: Annotated[
-        Path | None,
-        typer.Option(help="File of held-out rollouts; best with another excitation."),
-    ] = None,
+    holdout_data: HoldoutDataOption = None,
     effect: EffectOption = None,
     candidates: Annotated[
         str,
@@ -132,7 +129,7 @@ def discover(
     Example: npdr discover furuta --data measured.csv --holdout 3,4 --out discovery
     """
     from npdr_ppl.cli.effect_words import named_effects
-    from npdr_ppl.cli.resolve import resolve_effects, resolve_holdout, resolve_model
+    from npdr_ppl.cli.resolve import resolve_effects, resolve_model, resolve_rollouts
     from npdr_ppl.cli.show_discovery import show_discovery
     from npdr_ppl.discovery import DiscoveryOptions, Investigation
     from npdr_ppl.discovery.discovery_folder import DiscoveryFolder, findings_until
@@ -144,7 +141,7 @@ def discover(
     from npdr_ppl.run_files import claimed, reading_back
 
     chosen = resolve_effects(resolve_model(model), effect or [])
-    train, test = resolve_holdout(data, holdout, holdout_data, mapping)
+    train, test = resolve_rollouts(data, holdout, holdout_data, mapping)
     options = data_options(None, segment_length, initial_state, precision, noise, strict)
     search = DiscoveryOptions(
         effects=tuple(named_effects([candidates])) if candidates else None,

@@ -11,6 +11,7 @@ from npdr_ppl.cli.options import (
     DeviceOption,
     EffectOption,
     EmbeddingOption,
+    HoldoutDataOption,
     HoldoutOption,
     InitialState,
     InitialStateOption,
@@ -52,6 +53,7 @@ def fit(
     seed: SeedOption = 0,
     mapping: MappingOption = None,
     holdout: HoldoutOption = "",
+    holdout_data: HoldoutDataOption = None,
     effect: EffectOption = None,
     embedding: EmbeddingOption = "score",
     segment_length: SegmentLengthOption = "auto",
@@ -90,7 +92,7 @@ def fit(
     chosen = resolve_effects(resolve_model(model), effect or [])
     method, features = resolve_backend(backend, embedding)
     options = data_options(features, segment_length, initial_state, precision, noise, strict)
-    train, test = resolve_rollouts(data, holdout, mapping)
+    train, test = resolve_rollouts(data, holdout, holdout_data, mapping)
     with (
         resumable(f"the same command again continues the run in {out}."),
         reporter(False if quiet else None) as report,

@@ -31,6 +31,7 @@ __all__ = [
     "DeviceOption",
     "EffectOption",
     "EmbeddingOption",
+    "HoldoutDataOption",
     "HoldoutOption",
     "InitialState",
     "InitialStateOption",
@@ -113,6 +114,10 @@ RolloutsOption = Annotated[int, _ROLLOUTS]
 OptionalRolloutsOption = Annotated[int | None, _ROLLOUTS]
 HoldoutOption = Annotated[
     str, typer.Option(help="Rollouts to hold out and to test on, e.g. 3,4; counted from 0.")
+]
+HoldoutDataOption = Annotated[
+    Path | None,
+    typer.Option(help="File of held-out rollouts; best with another excitation."),
 ]
 BackendOption = Annotated[
     str,

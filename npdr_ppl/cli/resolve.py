@@ -27,7 +27,6 @@ __all__ = [
     "resolve_backend",
     "resolve_device",
     "resolve_effects",
-    "resolve_holdout",
     "resolve_model",
     "resolve_rollouts",
     "resolve_search",
@@ -111,22 +110,31 @@ def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:
 
 
 def resolve_rollouts(
-    paths: Sequence[Path], holdout: str = "", mapping: Path | None = None
+    paths: Sequence[Path],
+    holdout: str = "",
+    holdout_data: Path | None = None,
+    mapping: Path | None = None,
 ) -> tuple[Any, Any]:
-    """Loads rollouts and splits off the held-out ones.
+    """Loads rollouts, and held-out ones from the same files or from another.
 
     Args:
         paths: CSV, Parquet, NPZ, NetCDF, or logs of any format that a mapping describes.
         holdout: Positions of held-out rollouts over all files, e.g. ``"3,4"``.
+        holdout_data: Another file, all of whose rollouts are held out.
         mapping: Which signals of the logs are channels and actions.
 
     Returns:
         Rollouts to fit, and held-out rollouts or ``None``.
 
     Raises:
-        DataError: A file is bad, files do not fit together, or a position does not exist.
+        DataError: A file is bad, files do not fit together, a position does not exist, or both
+            kinds of held-out rollouts were given.
     """
+    if holdout and holdout_data is not None:
+        raise DataError("--holdout and --holdout-data exclude each other; give one.")
     rollouts = load_all(paths, mapping)
+    if holdout_data is not None:
+        return rollouts, load_all([holdout_data], mapping)
     if not holdout:
         return rollouts, None
     told = paths[0] if len(paths) == 1 else f"all {len(paths)} files together"
@@ -160,30 +168,6 @@ def load_all(paths: Sequence[Path], mapping: Path | None = None) -> "Rollouts":
     from npdr_ppl.rollouts import Rollouts
 
     return Rollouts.load(paths, mapping)
-
-
-def resolve_holdout(
-    paths: Sequence[Path], holdout: str, file: Path | None, mapping: Path | None = None
-) -> tuple[Any, Any]:
-    """Loads rollouts, and held-out ones from the same files or from another.
-
-    Args:
-        paths: CSV, Parquet, NPZ, NetCDF, or logs of any format that a mapping describes.
-        holdout: Positions of held-out rollouts over all files, e.g. ``"3,4"``.
-        file: Another file, all of whose rollouts are held out.
-        mapping: Which signals of the logs are channels and actions.
-
-    Returns:
-        Rollouts to fit, and held-out rollouts or ``None``.
-
-    Raises:
-        DataError: A file is bad, a position does not exist, or both were given.
-    """
-    if file is None:
-        return resolve_rollouts(paths, holdout, mapping)
-    if holdout:
-        raise DataError("--holdout and --holdout-data exclude each other; give one.")
-    return load_all(paths, mapping), load_all([file], mapping)
 
 
 def resolve_device(word: str) -> str:

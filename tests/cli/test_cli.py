@@ -188,6 +188,10 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         (["fit", "pendulum", "--data", "missing.csv", "--out", "OUT"], "missing.csv"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "7"], "has 2"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "x"], "3,4"),
+        (
+            ["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "0", "--holdout-data", "DATA"],
+            "exclude each other",
+        ),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend", "mcmc"], "mcmc"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend", "snpe-c(flw=maf)"],
          "did you mean 'flow'"),
