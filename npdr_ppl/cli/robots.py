@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from npdr_ppl.atomic_files import replacing
+from npdr_ppl.progress import words_for
 from npdr_ppl.python_files import check_exists
 
 if TYPE_CHECKING:
@@ -17,6 +18,12 @@ if TYPE_CHECKING:
     from npdr_ppl.language.channels import Channel
 
 __all__ = ["inspect_robot"]
+
+RECORDED = 10.0
+"""Length in s of the recording for which times are printed."""
+
+FITS_OF_A_SEARCH = 5, 100
+"""Usual times of a search as multiples of that of the first fit."""
 
 
 def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
@@ -36,7 +43,7 @@ def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
     check_exists(path, "*.*")
     derived = derive_model(path)
     robot = MujocoSimulator(path)
-    found = _described(derived, robot)
+    found = _described(derived, robot) | {"seconds to fit": _seconds_to_fit(path, robot)}
     if as_json:
         typer.echo(json.dumps(found, indent=2, ensure_ascii=False))
     else:
@@ -55,6 +62,18 @@ def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
         else:
             typer.echo("\nUse it as it is, or write it as Python to edit with --write FILE.py:")
         typer.echo(f"    npdr fit {model} --data LOG --out fit")
+
+
+def _seconds_to_fit(path: Path, robot: "MujocoSimulator") -> float | None:
+    """Returns how long the fit of a short recording takes in s; ``None`` if it cannot be told."""
+    from npdr_ppl.cli.resolve import resolve_model
+    from npdr_ppl.errors import NpdrError
+    from npdr_ppl.preparation.expected_time import seconds_to_fit
+
+    try:
+        return seconds_to_fit(resolve_model(str(path)), robot, recorded=RECORDED)
+    except NpdrError:  # no simulation succeeds, say; the fit will report it
+        return None
 
 
 def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
@@ -130,6 +149,18 @@ def _lines(found: dict[str, Any]) -> list[str]:
     for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
         names = [port["name"] for port in found["ports"] if port["kind"] == kind]
         lines.append(f"  {kind}: {', '.join(names)}")
+    if found["seconds to fit"] is not None:
+        few, many = FITS_OF_A_SEARCH
+        rows = [
+            (
+                "first fit",
+                words_for(found["seconds to fit"]),
+                "npdr fit and discover begin with it",
+            ),
+            ("npdr discover", f"{few} to {many} times as long", ""),
+        ]
+        lines += ["", f"Expected time on one core, for {RECORDED:g} s of recording, roughly:"]
+        lines += _table(rows)
     return lines
 
 

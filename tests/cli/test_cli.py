@@ -189,7 +189,8 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "7"], "has 2"),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "x"], "3,4"),
         (
-            ["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "0", "--holdout-data", "DATA"],
+            ["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--holdout", "0",
+             "--holdout-data", "DATA"],
             "exclude each other",
         ),
         (["fit", "pendulum", "--data", "DATA", "--out", "OUT", "--backend", "mcmc"], "mcmc"),
