@@ -63,7 +63,7 @@ def test_the_search_improves_a_policy_in_the_robots_file(example, tmp_path):
 def test_a_policy_trained_on_exported_draws_works_better_on_the_hidden_rig(example, tmp_path):
     folder = tmp_path / "elsewhere"
     effects = "hinge_torque.coulomb_friction,motor.input_delay"
-    wrapper = example.identify(folder, "--candidates", effects, num_steps=200)
+    wrapper = example.identify(folder, "--candidates", effects, num_steps=120)
     reached = example.compare(folder, wrapper, iterations=8, candidates=12, num_steps=200)
     print(reached)
     none, file, exported = reached.values()
