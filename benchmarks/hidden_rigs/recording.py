@@ -27,6 +27,22 @@ _LEAD = 0.2
 # play that shows, and the fastest shafts that show swing in twenty substeps.
 _FINER_BEHIND_GEARS = 10
 
+# Substeps in each hidden delay, lag or filter. What changes within a substep is shared out over
+# it, which resembles a lag. In a delay of half a substep, all that tells it from a lag is lost;
+# with five substeps in it, a hundredth.
+_SUBSTEPS_IN_A_DELAY = 5
+
+# Times the rig's substeps, at most: shorter delays hardly show.
+_FINEST = 20
+
+_TIMES = {
+    "input_delay": "delay",
+    "actuator_lag": "time_constant",
+    "sensor_delay": "delay",
+    "sensor_low_pass": "time_constant",
+}
+"""Names of the times of hidden effects that must last several substeps."""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -68,14 +84,13 @@ def record(
             is let go from somewhere else.
         seed: The seed.
         duration: Seconds per rollout; ``None`` for the rig's.
-        substeps: Integration steps per sample; ``None`` for the rig's, and ten times those behind
-            a gear or a shaft.
+        substeps: Integration steps per sample; ``None`` for the rig's, ten times those behind a
+            gear or a shaft, and more in a short delay or lag.
         played: Commands, ``(K, actions)``, that are played in one rollout without the rig's
             feedback, and the positions, ``(joints,)``, in which it is held until then; ``None``
             for excitations.
     """
-    is_behind_gears = any(h.effect_id in TRANSMISSIONS for h in hidden)
-    num_substeps = substeps or rig.substeps * (_FINER_BEHIND_GEARS if is_behind_gears else 1)
+    num_substeps = substeps or _num_substeps(rig, hidden)
     substep = rig.time_step / num_substeps
     num_steps = (
         round((duration or rig.duration) / rig.time_step) if played is None else len(played[0])
@@ -139,3 +154,13 @@ def record(
         action_units=units[1],
     )
     return Recording(rollouts, true.transpose(2, 0, 1))
+
+
+def _num_substeps(rig: Rig, hidden: Sequence[Hidden]) -> int:
+    """Returns the integration steps per sample that what is hidden needs."""
+    if any(h.effect_id in TRANSMISSIONS for h in hidden):
+        return rig.substeps * _FINER_BEHIND_GEARS
+    times = [h.parameters[_TIMES[h.effect_id]] for h in hidden if h.effect_id in _TIMES]
+    shortest = min((time for time in times if time > 0.0), default=math.inf)
+    needed = math.ceil(_SUBSTEPS_IN_A_DELAY * rig.time_step / shortest)
+    return min(max(rig.substeps, needed), _FINEST * rig.substeps)

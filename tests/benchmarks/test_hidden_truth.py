@@ -75,10 +75,8 @@ def fine(rig):
     """The simulator under test with so small steps that only the laws matter."""
     simulator = rig.simulator()
     if rig.name == "two_link_arm":
-        return type(simulator)(substeps=20)
-    return type(simulator)(
-        integrator="rk4", substeps=4 if rig.name.startswith("furuta") else 10, compile="never"
-    )
+        return type(simulator)(substeps=8)
+    return type(simulator)(integrator="rk4", substeps=4, compile="never")
 
 
 def after_silence(rollouts, num_steps=20):
@@ -134,7 +132,7 @@ def test_laws_mean_what_the_catalogue_means(name, port, effect_id):
     """With the true parameters the catalogue's effect explains the recording."""
     rig = RIGS[name]
     hidden = drawn(rig.port(port), effect_id, 1.0, np.random.default_rng(7))
-    rollouts = truth(rig, (hidden,), 0.8, is_from_rest=True).rollouts
+    rollouts = truth(rig, (hidden,), 0.4, is_from_rest=True).rollouts
     if effect_id in ("joint_elasticity", "backlash"):
         rollouts = after_silence(rollouts)
     without = size(simulated(rig, fine(rig), rollouts))
@@ -234,3 +232,22 @@ def test_truth_makers_import_no_engine_and_no_effect():
             if module.startswith("npdr_ppl.models"):
                 # Constants of the arm, and the rig in the other engine.
                 assert path.name in ("rigs.py", "furuta_engine.py")
+
+
+@pytest.mark.parametrize("delay", [5e-4, 1.4e-3])
+def test_a_short_delay_is_no_lag(delay):
+    """Substeps are so short that a delay and a lag of the same time differ as they should."""
+    rig = RIGS["emps"]
+
+    def recorded(effect_id, name, substeps=None):
+        hidden = (Hidden("voltage", effect_id, {name: delay}),)
+        found = record(
+            rig, ("steps",), parameters=parameters_of(rig), hidden=hidden, seed=3, duration=0.4,
+            substeps=substeps,
+        )  # fmt: skip
+        return found.rollouts.readings[0]
+
+    late = recorded("input_delay", "delay")
+    exact = recorded("input_delay", "delay", substeps=100)
+    lag = recorded("actuator_lag", "time_constant", substeps=100)
+    assert np.abs(late - exact).max() < 0.05 * np.abs(lag - exact).max()
