@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,7 +53,9 @@ def test_the_seed_decides_everything_but_the_strength():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_conditions(condition):
+def test_conditions(condition, monkeypatch):
+    # Nothing below looks at the motion, so a short one will do.
+    monkeypatch.setitem(RIGS, "emps", replace(RIGS["emps"], duration=0.5))
     number = len(places("emps", condition))
     # Of conditions with many places one strength will do: the loop over strengths is shared.
     strengths = [2.0] if number > 6 else [0.5, 2.0]

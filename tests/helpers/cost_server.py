@@ -7,6 +7,7 @@ Each line of the input is a JSON list: the kind of file, and its path. The answe
 and ``megabytes`` above the start.
 """
 
+import gc
 import json
 import os
 import signal
@@ -63,6 +64,9 @@ def main():
     from npdr_ppl.engines import bullet  # noqa: F401
 
     _ = npdr_ppl.MujocoSimulator
+    # Else the first collection in each child would go through, and copy, all that is imported.
+    gc.collect()
+    gc.freeze()
     print("ready", flush=True)
     for line in sys.stdin:
         print(json.dumps(measured(*json.loads(line))), flush=True)

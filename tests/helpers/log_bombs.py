@@ -3,9 +3,10 @@
 import json
 import sqlite3
 import struct
-import zlib
 
 import numpy as np
+
+from tests.helpers.tree_bombs import deflated_zeros
 
 
 def csv_of_a_long_vector(path):
@@ -56,17 +57,16 @@ def _mat(path, *elements):
     )
 
 
-def _packed(data):
-    body = zlib.compress(data, 9)
+def _packed(body):
     return struct.pack("<II", 15, len(body)) + body
 
 
 def mat_that_inflates(path):
-    _mat(path, _packed(b"\0" * 300_000_000))
+    _mat(path, _packed(deflated_zeros(300)))
 
 
 def mat_that_inflates_often(path):
-    _mat(path, *[_packed(b"\0" * 5_000_000) for _ in range(100)])
+    _mat(path, *[_packed(deflated_zeros(5))] * 100)
 
 
 def mat_of_a_huge_struct(path):

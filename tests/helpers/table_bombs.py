@@ -115,8 +115,9 @@ def parquet_of_many_columns(path):
 
 
 def parquet_of_long_text(path):
-    text = pa.array(["x" * 100_000_000] * 4)
-    pq.write_table(pa.table({"rollout": text}), path, compression="zstd")
+    ends = pa.array(range(0, 500_000_000, 100_000_000), pa.int32())
+    text = pa.StringArray.from_buffers(4, ends.buffers()[1], pa.py_buffer(b"x" * 400_000_000))
+    pq.write_table(pa.table({"rollout": text}), path, compression="zstd", write_statistics=False)
 
 
 def parquet_of_many_row_groups(path):
@@ -164,14 +165,18 @@ def _npz(path, **changes):
         "channel_units": np.array([""]),
         "action_units": np.array([], dtype=np.str_),
     } | changes
-    np.savez_compressed(path, **content)
+    # As NumPy does it, but with little effort: the weakest compression is many times faster.
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, values in content.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(values))
 
 
 def _npz_member(path, name, data, compression=zipfile.ZIP_DEFLATED):
     _npz(path)
     with zipfile.ZipFile(path) as archive:
         members = {member: archive.read(member) for member in archive.namelist()}
-    with zipfile.ZipFile(path, "w") as archive:
+    with zipfile.ZipFile(path, "w", compresslevel=1) as archive:
         for member, content in (members | {f"{name}.npy": data}).items():
             archive.writestr(member, content, compression)
 

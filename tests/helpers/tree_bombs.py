@@ -11,6 +11,14 @@ ROLLOUT = b"cpyrado.sampling.step_sequence\nStepSequence\n"
 F8 = b"cnumpy\ndtype\nX\x02\x00\x00\x00f8K\x00K\x01\x87R"
 
 
+def deflated_zeros(count):
+    """Returns what ``zlib`` makes of so many millions of zeros, without deflating each of them."""
+    compressor = zlib.compressobj(9, wbits=-zlib.MAX_WBITS)
+    million = compressor.compress(bytes(1_000_000)) + compressor.flush(zlib.Z_FULL_FLUSH)
+    checksum = (count * 1_000_000 % 65_521) << 16 | 1  # Adler-32 of zeros
+    return b"\x78\xda" + million * count + compressor.flush() + struct.pack(">I", checksum)
+
+
 def _file(path, **options):
     return h5py.File(path, "w", **options)
 
@@ -22,7 +30,8 @@ def nc_of_chunks_that_are_not_stored(path):
 
 def nc_of_zeros(path):
     with _file(path) as file:
-        file.create_dataset("angle", data=np.zeros((1, 40_000_000)), compression="gzip")
+        file.create_dataset("angle", data=np.zeros((1, 40_000_000)), compression="gzip",
+                            compression_opts=1)  # fmt: skip
 
 
 def nc_of_almost_too_much(path):
@@ -32,7 +41,9 @@ def nc_of_almost_too_much(path):
     with h5netcdf.File(path, "w") as file:
         file.dimensions = dimensions
         for name, values in (("time", np.arange(count) * 0.1), ("angle", np.zeros(count))):
-            data = file.create_variable(name, tuple(dimensions), "f8", compression="gzip")
+            data = file.create_variable(
+                name, tuple(dimensions), "f8", compression="gzip", compression_opts=1
+            )
             data[...] = values[None]
             data.attrs["kind"] = "time" if name == "time" else "channel"
         file.create_variable("num_steps", ("rollout",), data=np.array([count - 1]))
@@ -47,7 +58,7 @@ def nc_of_small_integers(path):
 def nc_of_a_chunk_that_is_larger_than_stated(path):
     with _file(path) as file:
         data = file.create_dataset("angle", (10,), "f8", chunks=(10,), compression="gzip")
-        data.id.write_direct_chunk((0,), zlib.compress(bytes(800_000_000), 9))
+        data.id.write_direct_chunk((0,), deflated_zeros(800))
 
 
 def nc_of_a_huge_chunk(path):
@@ -55,7 +66,7 @@ def nc_of_a_huge_chunk(path):
         data = file.create_dataset(
             "angle", (10,), "f8", chunks=(90_000_000,), maxshape=(None,), compression="gzip"
         )
-        data.id.write_direct_chunk((0,), zlib.compress(bytes(720_000_000), 9))
+        data.id.write_direct_chunk((0,), deflated_zeros(720))
 
 
 def nc_of_text_that_many_share(path):
