@@ -23,7 +23,8 @@ RECORDED = 10.0
 """Length in s of the recording for which times are printed."""
 
 FITS_OF_A_SEARCH = 5, 100
-"""Usual times of a search as multiples of that of the first fit."""
+"""Usual times of a search as multiples of that of the first fit; 100 on an XL330 servo, where four
+effects were found."""
 
 
 def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:

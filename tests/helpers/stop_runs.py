@@ -22,8 +22,6 @@ import sys
 import time
 from pathlib import Path
 
-from tests.engines.test_safe_path import drifting
-
 PR_SET_CHILD_SUBREAPER = 36
 LIMIT = 10.0
 """Default of the seconds after which nothing may be left."""
@@ -69,7 +67,11 @@ def write_inputs(folder):
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "own.py").write_text(MODEL)
     (folder / "hang").touch()
-    drifting().to_csv(folder / "recording.csv")
+    if not (folder / "recording.csv").exists():
+        # Takes seconds to import, which a test has done already.
+        from tests.engines.test_safe_path import drifting
+
+        drifting().to_csv(folder / "recording.csv")
 
 
 def start(folder, executor):
