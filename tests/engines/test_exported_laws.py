@@ -34,7 +34,6 @@ from tests.helpers.exported_robots import (
     ARM,
     attachable,
     difference,
-    exported,
     probed,
     refusals,
     write_robots,
@@ -211,24 +210,21 @@ def test_other_sensors_are_measured_after_the_step(arm, tmp_path):
 @pytest.mark.slow
 def test_ten_robots_with_every_effect(tmp_path, capsys):
     table = []
-    # Half a second each: the tests above go over the whole second, on one robot.
-    catalogue = effects()
     for name, path in write_robots(tmp_path).items():
         base = MujocoSimulator(path, time_step=0.01)
         worst = {"file": 0.0, "Python": 0.0}
         count = {"file": 0, "Python": 0}
         refused = []
-        for identifier in sorted(set(catalogue) - REFUSED - {"contact"}):
-            effect = attachable(base, catalogue[identifier])
+        for identifier in sorted(set(effects()) - REFUSED - {"contact"}):
+            effect = attachable(base, effects()[identifier])
             if effect is None:
                 continue
             simulator = base.with_effects(effect)
             values = probed(simulator, effect)
-            found = exported(simulator, values)
-            if found.refused:
+            if refusals(simulator, values):
                 refused.append(identifier)
                 continue
-            error, _, where = difference(simulator, values, tmp_path, seconds=0.5, found=found)
+            error, _, where = difference(simulator, values, tmp_path)
             worst[where] = max(worst[where], error)
             count[where] += 1
         table.append((name, count, worst, refused))

@@ -16,7 +16,6 @@ from npdr_ppl.cli.main import main, run
 from npdr_ppl.cli.manners import Commands, Stopped, resumable, stop_on_signals
 from npdr_ppl.engines.workers import Pool, WorkerOptions
 from npdr_ppl.engines.workers.guard import guarded_cluster
-from tests.engines.test_safe_path import drifting
 from tests.helpers.pool_tasks import StartsPrograms
 
 ROOT = Path(__file__).parents[2]
@@ -46,7 +45,6 @@ def test_a_stopped_fit_leaves_no_process(tmp_path, name):
     # Two minutes, for very busy machines; otherwise it takes seconds. Without a watch on its
     # parent, a worker of loky lives for five minutes. The signals come within half a second after
     # a simulation has begun to hang; benchmarks/stopped_runs.py takes any moment.
-    drifting().to_csv(tmp_path / "recording.csv")
     done = subprocess.run(
         [sys.executable, str(SCRIPT), str(tmp_path), name, "2", "117", "120", "0.5"],
         env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True,

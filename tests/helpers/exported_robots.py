@@ -121,18 +121,13 @@ def commands_of(simulator, num_steps):
     return np.stack(columns, axis=-1)
 
 
-def exported(simulator, values):
-    """Returns what is exported."""
-    given = {n: torch.tensor(float(v), dtype=torch.float64) for n, v in values.items()}
-    return export_mjcf(simulator, given, time_step=CONTROL_STEP)
-
-
 def refusals(simulator, values):
     """Returns why effects are not exported, by their names."""
-    return exported(simulator, values).refused
+    given = {n: torch.tensor(float(v), dtype=torch.float64) for n, v in values.items()}
+    return export_mjcf(simulator, given, time_step=CONTROL_STEP).refused
 
 
-def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0, found=None):
+def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0):
     """Returns how far the exported robot is from the model, how much the effects matter, and how.
 
     Args:
@@ -141,12 +136,11 @@ def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0, found=No
         folder: Folder of the new files.
         seconds: Time to simulate.
         velocity: Velocity of every joint at the start.
-        found: What is exported, if that is known already.
     """
     num_steps = round(seconds / CONTROL_STEP)
     given = {n: torch.tensor(float(v), dtype=torch.float64) for n, v in values.items()}
     commands = commands_of(simulator, num_steps)
-    found = exported(simulator, values) if found is None else found
+    found = export_mjcf(simulator, given, time_step=CONTROL_STEP)
     assert not found.refused, found.refused
     path = folder / "identified.xml"
     path.write_text(found.text)

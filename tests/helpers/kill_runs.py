@@ -50,7 +50,7 @@ SLOW_IMPORTS = ("torch._dynamo", "npdr_ppl.arviz_module", "xarray")
 def import_what_a_run_needs(folder, seed, mode):
     """Imports what a run has imported in the end, so that its children need not.
 
-    Returns after how many seconds that run had how many files.
+    Returns after how many seconds that run had written how many files.
     """
     for name in SLOW_IMPORTS:
         importlib.import_module(name)
@@ -117,9 +117,27 @@ def written(folder):
     return tuple(sorted(str(file.relative_to(folder)) for file in folder.rglob("*.*")))
 
 
-def num_files(folder):
-    """How many files a run has on disk: how far it has come."""
-    return sum(file.suffix != ".tmp" for file in folder.rglob("*.*"))
+class Progress:
+    """Counts the files that a run writes, or writes anew, from now on."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.seen = self.stamps()
+        self.count = 0
+
+    def stamps(self):
+        found = {}
+        for file in self.folder.rglob("*.*"):
+            with contextlib.suppress(OSError):  # a temporary file that has been renamed by now
+                found[file] = file.stat().st_mtime_ns
+        return found
+
+    def look(self):
+        """Returns how many have been written."""
+        now = self.stamps()
+        self.count += sum(self.seen.get(file) != stamp for file, stamp in now.items())
+        self.seen |= now
+        return self.count
 
 
 def has_ended(child):
@@ -127,28 +145,27 @@ def has_ended(child):
 
 
 def timed(child, folder):
-    """Waits for a run; returns after how many seconds it had how many files."""
-    started, times = time.monotonic(), [(0.0, 0)]
+    """Waits for a run; returns after how many seconds it had written how many files."""
+    progress, started, times = Progress(folder), time.monotonic(), [(0.0, 0)]
     while not has_ended(child):
-        if (number := num_files(folder)) > times[-1][1]:
-            times.append((time.monotonic() - started, number))
+        if progress.look() > times[-1][1]:
+            times.append((time.monotonic() - started, progress.count))
         time.sleep(POLLING)
     finish(child)
     return times
 
 
-def live(seconds, times, child, folder):
-    """Waits until a run has come as much further as the undisturbed one in so many seconds.
+def live_until(moment, times, child, folder):
+    """Waits until a run has come as far as the undisturbed one had by a moment, or has ended.
 
-    That is until it has as many files as that one had then, and for the seconds since the last of
-    them: where the machine has become slower, so does this wait.
+    That is as many files, and then as many seconds since the last of them: where the machine has
+    become slower, so does this wait.
     """
-    present = num_files(folder)
-    begin = max(point for point in times if point[1] <= present)[0]
-    since, files = max(point for point in times if point[0] <= begin + seconds)
-    while num_files(folder) < files and not has_ended(child):
+    since, files = max(point for point in times if point[0] <= moment)
+    progress = Progress(folder)
+    while progress.look() < files and not has_ended(child):
         time.sleep(POLLING)
-    until = time.monotonic() + begin + seconds - since
+    until = time.monotonic() + moment - since
     while time.monotonic() < until and not has_ended(child):
         time.sleep(POLLING)
 
@@ -178,11 +195,11 @@ def main():
         # Short lives, so that a run is killed several times on its way; longer ones after each
         # kill, so that it comes to its end. Discovery begins anew after a kill, so it needs lives
         # that are longer than it is.
-        longest = (1.0 if mode == "discover" else 0.4) * seconds
+        longest = (1.0 if mode == "discover" else 0.3) * seconds
         while not is_done:
             child = fork(folder, seed, mode)
             if kills < num_kills:
-                live(moments.uniform(0.0, longest), times, child, folder)
+                live_until(moments.uniform(0.0, longest), times, child, folder)
                 longest *= 1.1
                 os.kill(child, signal.SIGKILL)
             _, status = os.waitpid(child, 0)

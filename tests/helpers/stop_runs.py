@@ -22,6 +22,8 @@ import sys
 import time
 from pathlib import Path
 
+from tests.engines.test_safe_path import drifting
+
 PR_SET_CHILD_SUBREAPER = 36
 LIMIT = 10.0
 """Default of the seconds after which nothing may be left."""
@@ -67,11 +69,7 @@ def write_inputs(folder):
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "own.py").write_text(MODEL)
     (folder / "hang").touch()
-    if not (folder / "recording.csv").exists():
-        # Takes seconds to import, which a test has done already.
-        from tests.engines.test_safe_path import drifting
-
-        drifting().to_csv(folder / "recording.csv")
+    drifting().to_csv(folder / "recording.csv")
 
 
 def start(folder, executor):
