@@ -1,6 +1,5 @@
 """Helper processes never import modules from the current folder, such as a downloads folder."""
 
-import json
 import os
 import subprocess
 import sys
@@ -23,28 +22,15 @@ STOLEN = (
 """Names of modules that helper processes import."""
 
 POOL = """
-import json
-import socket
 import sys
-import psutil
 from npdr_ppl.engines.workers import Pool, WorkerOptions
 from tests.helpers.pool_tasks import Noise
 
 if __name__ == "__main__":
-    for executor in sys.argv[1:]:
-        number = None if executor == "serial" else 2
-        with Pool(WorkerOptions(executor, number, chunk_size=2)) as pool:
-            assert len(pool.run(Noise(), range(6), seed=7).values) == 6
-            family = [psutil.Process(), *psutil.Process().children(recursive=True)]
-            places = []
-            for process in family:
-                for place in process.net_connections("inet"):
-                    is_datagram = place.type == socket.SOCK_DGRAM
-                    if place.status == psutil.CONN_LISTEN or (is_datagram and not place.raddr):
-                        places.append(place.laddr.ip)
-            print(json.dumps([executor, len(family), places]), flush=True)
+    number = None if sys.argv[1] == "serial" else 2
+    with Pool(WorkerOptions(sys.argv[1], number, chunk_size=2)) as pool:
+        assert len(pool.run(Noise(), range(6), seed=7).values) == 6
 """
-"""Prints for every executor how many processes it has, and where they listen."""
 
 
 OWN_MODEL = """
@@ -107,79 +93,53 @@ def test_the_folder_would_be_imported_from_without_protection(hostile):
     assert ran(hostile) == ["joblib", "json"]
 
 
-def executor(name, package):
-    missing = find_spec(package) is None
+def executor(name, package=None):
+    missing = package is not None and find_spec(package) is None
     marks = (pytest.mark.slow, pytest.mark.skipif(missing, reason=f"{package} is not installed"))
-    return pytest.param((name,), marks=marks, id=name)
+    return pytest.param(name, marks=marks if package else ())
 
 
 @pytest.mark.parametrize(
-    "names",
+    "name",
     [
-        # The same modules in all of them: one process tries them one after the other.
-        pytest.param(("serial", "threads", "loky"), id="serial, threads, loky"),
+        executor("serial"),
+        executor("threads"),
+        executor("loky"),
         executor("dask", "distributed"),
         executor("ray", "ray"),
     ],
 )
-def test_workers_import_nothing_from_the_current_folder_and_listen_on_loopback_only(
-    hostile, tmp_path, names
-):
-    pytest.importorskip("psutil")
+def test_workers_import_nothing_from_the_current_folder(hostile, tmp_path, name):
     script = tmp_path / "pool.py"
     script.write_text(POOL)
-    done = run(hostile, str(script), *names)
-    assert done.returncode == 0, done.stderr[-2000:]
+    done = run(hostile, str(script), name)
+    assert done.returncode == 0, done.stderr
     assert ran(hostile) == []
-    rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('["')]
-    assert [name for name, _, _ in rows] == list(names)
-    for name, num_processes, places in rows:
-        if name not in ("serial", "threads"):
-            assert num_processes > 2
-        assert set(places) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
-        if name in ("dask", "ray"):  # the others use pipes
-            assert places
-
-
-COMMANDS = (
-    ("fit", "own.py:model", "--backend", "abc", "--initial-state", "recorded",
-     "--simulations", "20", "--workers", "2", "--out", "fit"),
-    ("compare", "pendulum", "--backends", "abc,bayesian-linear-regression", "--simulations",
-     "60", "--workers", "2", "--out", "compare"),
-    ("discover", "pendulum", "--candidates", "hinge.coulomb_friction,hinge.spring",
-     "--workers", "2", "--out", "found"),
-)  # fmt: skip
-
-ALL_COMMANDS = """
-import json
-import os
-import sys
-from npdr_ppl.cli.main import main
-
-for words in json.loads(sys.argv.pop()):
-    sys.argv[1:] = words
-    try:
-        main()
-    except SystemExit as stop:
-        if stop.code:
-            raise
-    print("ran", words[0], os.listdir("../ran"), flush=True)
-"""
-"""Runs commands one after the other, as each starts workers of its own."""
 
 
 @pytest.mark.slow
-def test_commands_import_nothing_from_the_folder_of_a_recording(hostile):
-    commands = []
-    for word, model, *options in COMMANDS:
-        rollouts = swinging(rollouts=2, steps=100) if model == "pendulum" else drifting()
-        rollouts.to_csv(hostile / f"{word}.csv")
-        commands.append((word, model, "--data", f"{word}.csv", *options))
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("fit", "own.py:model", "--backend", "abc", "--initial-state", "recorded",
+         "--simulations", "60", "--workers", "2", "--out", "fit"),
+        ("compare", "pendulum", "--backends", "abc,bayesian-linear-regression", "--simulations",
+         "60", "--workers", "2", "--out", "compare"),
+        ("discover", "pendulum", "--candidates", "hinge.coulomb_friction,hinge.spring",
+         "--workers", "2", "--out", "found"),
+    ],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_commands_import_nothing_from_the_folder_of_a_recording(hostile, command):
+    word, model, *options = command
+    rollouts = swinging(rollouts=2, steps=100) if model == "pendulum" else drifting()
+    rollouts.to_csv(hostile / "recording.csv")
     (hostile / "own.py").write_text(OWN_MODEL)
-    done = run(hostile, "-c", ALL_COMMANDS, json.dumps(commands))
+    done = run(
+        hostile, "-c", "from npdr_ppl.cli.main import main; main()", word, model,
+        "--data", "recording.csv", *options,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
-    finished = [line for line in done.stdout.splitlines() if line.startswith("ran ")]
-    assert finished == [f"ran {word} []" for word, *_ in COMMANDS]
     assert ran(hostile) == []
 
 
@@ -192,3 +152,41 @@ def test_a_simulator_may_start_scripts_that_import_what_lies_beside_them(tmp_pat
     monkeypatch.setenv("PYTHONSAFEPATH", "1")
     with safe_path():
         assert inherited_environment()["PYTHONSAFEPATH"] == "1"
+
+
+LISTENING = """
+import socket
+import sys
+import psutil
+from npdr_ppl.engines.workers import Pool, WorkerOptions
+from tests.helpers.pool_tasks import Noise
+
+if __name__ == "__main__":
+    with Pool(WorkerOptions(sys.argv[1], 2)) as pool:
+        pool.run(Noise(), range(4), seed=7)
+        family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        print(len(family))
+        for process in family:
+            for place in process.net_connections("inet"):
+                is_datagram = place.type == socket.SOCK_DGRAM
+                if place.status == psutil.CONN_LISTEN or (is_datagram and not place.raddr):
+                    print(place.laddr.ip)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("executor", "package"), [
+    ("loky", "joblib"), ("dask", "distributed"), ("ray", "ray"),
+])  # fmt: skip
+def test_workers_of_our_own_listen_on_the_loopback_interface_only(tmp_path, executor, package):
+    pytest.importorskip(package)
+    pytest.importorskip("psutil")
+    script = tmp_path / "listening.py"
+    script.write_text(LISTENING)
+    done = run(tmp_path, str(script), executor)
+    assert done.returncode == 0, done.stderr[-2000:]
+    number, *places = done.stdout.split()
+    assert int(number) > 2
+    assert set(places) <= {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
+    if executor != "loky":  # which uses pipes
+        assert places

@@ -1,8 +1,5 @@
 """Kills a run of the NPDR loop at random moments, resumes it, and compares what comes out.
 
-The moments are those of an undisturbed run, told by the files that it had written by then, so that
-the kills meet the runs everywhere on their way also where the machine is busy.
-
     python kill_runs.py FOLDER NUM_KILLS SEED [discover | check]
 
 One process imports everything, also what a run imports later, and forks a child for every
@@ -40,26 +37,14 @@ from tests.helpers.small_loop import (
     without_remedies,
 )
 
-POLLING = 0.003
-"""Seconds between two looks at a run."""
-
-SLOW_IMPORTS = ("torch._dynamo", "npdr_ppl.arviz_module", "xarray")
-"""Imported before the first run, which would import them for itself alone."""
-
 
 def import_what_a_run_needs(folder, seed, mode):
-    """Imports what a run has imported in the end, so that its children need not.
-
-    Returns after how many seconds that run had written how many files.
-    """
-    for name in SLOW_IMPORTS:
-        importlib.import_module(name)
+    """Imports what a run has imported in the end, so that its children need not."""
     names = folder.with_suffix(".modules")
-    times = timed(fork(folder, seed, mode, names), folder)
+    finish(fork(folder, seed, mode, names))
     for name in names.read_text().split():
         with contextlib.suppress(Exception):
             importlib.import_module(name)
-    return times
 
 
 def fork(folder, seed, mode, modules=None):
@@ -117,71 +102,21 @@ def written(folder):
     return tuple(sorted(str(file.relative_to(folder)) for file in folder.rglob("*.*")))
 
 
-class Progress:
-    """Counts the files that a run writes, or writes anew, from now on."""
-
-    def __init__(self, folder):
-        self.folder = folder
-        self.seen = self.stamps()
-        self.count = 0
-
-    def stamps(self):
-        found = {}
-        for file in self.folder.rglob("*.*"):
-            with contextlib.suppress(OSError):  # a temporary file that has been renamed by now
-                found[file] = file.stat().st_mtime_ns
-        return found
-
-    def look(self):
-        """Returns how many have been written."""
-        now = self.stamps()
-        self.count += sum(self.seen.get(file) != stamp for file, stamp in now.items())
-        self.seen |= now
-        return self.count
-
-
-def has_ended(child):
-    return os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-
-
-def timed(child, folder):
-    """Waits for a run; returns after how many seconds it had written how many files."""
-    progress, started, times = Progress(folder), time.monotonic(), [(0.0, 0)]
-    while not has_ended(child):
-        if progress.look() > times[-1][1]:
-            times.append((time.monotonic() - started, progress.count))
-        time.sleep(POLLING)
-    finish(child)
-    return times
-
-
-def live_until(moment, times, child, folder):
-    """Waits until a run has come as far as the undisturbed one had by a moment, or has ended.
-
-    That is as many files, and then as many seconds since the last of them: where the machine has
-    become slower, so does this wait.
-    """
-    since, files = max(point for point in times if point[0] <= moment)
-    progress = Progress(folder)
-    while progress.look() < files and not has_ended(child):
-        time.sleep(POLLING)
-    until = time.monotonic() + moment - since
-    while time.monotonic() < until and not has_ended(child):
-        time.sleep(POLLING)
-
-
 def main():
     root, num_kills, seed = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     mode = sys.argv[4] if len(sys.argv) > 4 else ""
     torch.set_num_threads(1)
     moments = random.Random(seed)
+    started = time.monotonic()
     if mode == "discover":
         # Takes so much longer than its imports that one run will do for both.
-        times = import_what_a_run_needs(root / "undisturbed", seed, mode)
+        import_what_a_run_needs(root / "undisturbed", seed, mode)
+        seconds = 0.8 * (time.monotonic() - started)
     else:
         import_what_a_run_needs(root / "first", seed, mode)
-        times = timed(fork(root / "undisturbed", seed, mode), root / "undisturbed")
-    seconds = times[-1][0]
+        started = time.monotonic()
+        finish(fork(root / "undisturbed", seed, mode))
+        seconds = time.monotonic() - started
     expected = outcome(root / "undisturbed")
     planned = episodes(root / "undisturbed")
     if planned != list(range(len(expected["rollouts"]))):
@@ -193,14 +128,14 @@ def main():
         runs += 1
         is_done = False
         # Short lives, so that a run is killed several times on its way; longer ones after each
-        # kill, so that it comes to its end. Discovery begins anew after a kill, so it needs lives
-        # that are longer than it is.
-        longest = (1.0 if mode == "discover" else 0.3) * seconds
+        # kill, so that it comes to its end also where the machine has become slower since.
+        # Discovery begins anew after a kill, so it needs lives that are longer than it is.
+        longest = (1.0 if mode == "discover" else 0.4) * seconds
         while not is_done:
             child = fork(folder, seed, mode)
+            time.sleep(moments.uniform(0.0, longest))
+            longest *= 1.1
             if kills < num_kills:
-                live_until(moments.uniform(0.0, longest), times, child, folder)
-                longest *= 1.1
                 os.kill(child, signal.SIGKILL)
             _, status = os.waitpid(child, 0)
             is_done = status == 0

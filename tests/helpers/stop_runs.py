@@ -1,13 +1,11 @@
 """Ends fits by signals at random moments, and counts what they leave running.
 
-    python stop_runs.py FOLDER EXECUTORS NUM_STOPS SEED [LIMIT [LONGEST]]
+    python stop_runs.py FOLDER EXECUTORS NUM_STOPS SEED [LIMIT]
 
 The model's simulator starts a program for every simulation, and a share of simulations hangs while
-its program runs. With ``LONGEST``, the signal comes at most so many seconds after a simulation has
-begun to hang, otherwise at any moment after the first worker was started. Every process whose
-parent has ended becomes a child of this one, so none can hide. Prints a row of JSON for each stop:
-the executor, the signal, after how many seconds it came, the exit code, and what was left
-``LIMIT`` seconds later.
+its program runs. Every process whose parent has ended becomes a child of this one, so none can
+hide. Prints a row of JSON for each stop: the executor, the signal, after how many seconds it came,
+the exit code, and what was left ``LIMIT`` seconds later.
 """
 
 import contextlib
@@ -116,19 +114,11 @@ def is_worker(run, process, words):
     return process != run.pid and "resource_tracker" not in words
 
 
-def has_begun(waits_for_hanging):
-    """Returns whether a worker has been started, or a simulation hangs on it."""
-    found = descendants()
-    if waits_for_hanging:
-        return any(words.startswith("sleep 600") for words in found.values())
-    return len(found) >= 2
-
-
-def stop(folder, executor, number, seconds, limit, waits_for_hanging=False):
-    """Ends a fit by a signal, so long after it has begun; returns a row."""
+def stop(folder, executor, number, seconds, limit):
+    """Ends a fit by a signal, so long after its first worker was started; returns a row."""
     run = start(folder, executor)
     # The command's own imports take seconds in which there is nothing to leave behind.
-    while not has_begun(waits_for_hanging) and run.poll() is None:
+    while len(descendants()) < 2 and run.poll() is None:
         time.sleep(0.01)
     time.sleep(seconds)
     running = len(descendants())
@@ -168,7 +158,6 @@ def stop(folder, executor, number, seconds, limit, waits_for_hanging=False):
 def main():
     folder, executors, num_stops, seed = sys.argv[1:5]
     limit = float(sys.argv[5]) if len(sys.argv) > 5 else LIMIT
-    longest = float(sys.argv[6]) if len(sys.argv) > 6 else None
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
     moments = random.Random(int(seed))
     write_inputs(Path(folder))
@@ -178,8 +167,9 @@ def main():
             if (Path(folder) / "fit" / "fit.json").exists():
                 shutil.rmtree(Path(folder) / "fit")
             chosen = (signal.SIGTERM, signal.SIGKILL)[number % 2]
-            seconds = moments.uniform(0.0, LONGEST[executor] if longest is None else longest)
-            row = stop(Path(folder), executor, chosen, seconds, limit, longest is not None)
+            row = stop(
+                Path(folder), executor, chosen, moments.uniform(0.0, LONGEST[executor]), limit
+            )
             print(json.dumps(row), flush=True)
 
 
