@@ -22,10 +22,6 @@ __all__ = ["inspect_robot"]
 RECORDED = 10.0
 """Length in s of the recording for which times are printed."""
 
-FITS_OF_A_SEARCH = 5, 100
-"""Usual times of a search as multiples of that of the first fit; 100 on an XL330 servo, where four
-effects were found."""
-
 
 def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
     """Prints the model that is derived from a robot's file, and the columns that a log needs.
@@ -44,7 +40,7 @@ def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
     check_exists(path, "*.*")
     derived = derive_model(path)
     robot = MujocoSimulator(path)
-    found = _described(derived, robot) | {"seconds to fit": _seconds_to_fit(path, robot)}
+    found = _described(derived, robot) | {"expected time": _expected_time(path, robot)}
     if as_json:
         typer.echo(json.dumps(found, indent=2, ensure_ascii=False))
     else:
@@ -65,16 +61,23 @@ def inspect_robot(path: Path, write: Path | None, as_json: bool) -> None:
         typer.echo(f"    npdr fit {model} --data LOG --out fit")
 
 
-def _seconds_to_fit(path: Path, robot: "MujocoSimulator") -> float | None:
-    """Returns how long the fit of a short recording takes in s; ``None`` if it cannot be told."""
+def _expected_time(path: Path, robot: "MujocoSimulator") -> dict[str, float | None]:
+    """Returns how long the first fit of a recording takes in s, for JSON."""
     from npdr_ppl.cli.resolve import resolve_model
     from npdr_ppl.errors import NpdrError
     from npdr_ppl.preparation.expected_time import seconds_to_fit
 
+    sensors = {sensor.name for sensor in robot.sensors}
+    pose = {
+        state.name: float(robot.initial_positions[component.address])
+        for component, state in zip(robot.components, robot.states, strict=True)
+        if not component.is_velocity and state.name in sensors
+    }
     try:
-        return seconds_to_fit(resolve_model(str(path)), robot, recorded=RECORDED)
-    except NpdrError:  # no simulation succeeds, say; the fit will report it
-        return None
+        seconds = seconds_to_fit(resolve_model(str(path)), pose, recorded=RECORDED)
+    except NpdrError:  # the fit will say what is wrong
+        seconds = None
+    return {"recorded": RECORDED, "first fit": seconds}
 
 
 def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
@@ -116,6 +119,8 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
 
 def _lines(found: dict[str, Any]) -> list[str]:
     """Returns the description as text."""
+    from npdr_ppl.preparation.expected_time import FEWEST_FITS, MOST_FITS
+
     step, parameters, columns = found["time step"], found["parameters"], found["columns"]
     rows = [("parameter", "file", "prior", "unit", "sets")]
     for p in parameters:
@@ -150,18 +155,15 @@ def _lines(found: dict[str, Any]) -> list[str]:
     for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
         names = [port["name"] for port in found["ports"] if port["kind"] == kind]
         lines.append(f"  {kind}: {', '.join(names)}")
-    if found["seconds to fit"] is not None:
-        few, many = FITS_OF_A_SEARCH
+    expected = found["expected time"]
+    if expected["first fit"] is not None:
+        first = words_for(expected["first fit"])
         rows = [
-            (
-                "first fit",
-                words_for(found["seconds to fit"]),
-                "npdr fit and discover begin with it",
-            ),
-            ("npdr discover", f"{few} to {many} times as long", ""),
+            ("closest fit", first, "the first step of npdr fit and npdr discover"),
+            ("npdr discover", f"{FEWEST_FITS} to {MOST_FITS} times as long", ""),
         ]
-        lines += ["", f"Expected time on one core, for {RECORDED:g} s of recording, roughly:"]
-        lines += _table(rows)
+        title = f"Expected time on this machine, for {expected['recorded']:g} s of recording"
+        lines += ["", f"{title}, roughly:", *_table(rows)]
     return lines
 
 
