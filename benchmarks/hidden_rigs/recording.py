@@ -27,12 +27,13 @@ _LEAD = 0.2
 # play that shows, and the fastest shafts that show swing in twenty substeps.
 _FINER_BEHIND_GEARS = 10
 
-# Substeps in each hidden delay, lag or filter. What changes within a substep is shared out over
-# it, which resembles a lag. In a delay of half a substep, all that tells it from a lag is lost;
-# with five substeps in it, a hundredth.
+# Substeps in each hidden delay, lag or filter. A command that changes within a substep is averaged
+# over it, which acts like a lag. A delay of half a substep then cannot be told from a lag; with
+# five substeps in the delay, their difference is wrong by a hundredth.
 _SUBSTEPS_IN_A_DELAY = 5
 
-# Times the rig's substeps, at most: shorter delays hardly show.
+# Times the rig's substeps, at most, so that a recording takes seconds. In delays below a quarter
+# of the rig's substep there are fewer than five.
 _FINEST = 20
 
 _TIMES = {
@@ -41,7 +42,7 @@ _TIMES = {
     "sensor_delay": "delay",
     "sensor_low_pass": "time_constant",
 }
-"""Names of the times of hidden effects that must last several substeps."""
+"""The parameter of each hidden effect that is a time and must last several substeps."""
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,10 @@ def record(
 
 
 def _num_substeps(rig: Rig, hidden: Sequence[Hidden]) -> int:
-    """Returns the integration steps per sample that what is hidden needs."""
-    if any(h.effect_id in TRANSMISSIONS for h in hidden):
-        return rig.substeps * _FINER_BEHIND_GEARS
+    """Returns the integration steps per sample that the hidden effects need."""
+    is_behind_gears = any(h.effect_id in TRANSMISSIONS for h in hidden)
+    least = rig.substeps * (_FINER_BEHIND_GEARS if is_behind_gears else 1)
     times = [h.parameters[_TIMES[h.effect_id]] for h in hidden if h.effect_id in _TIMES]
     shortest = min((time for time in times if time > 0.0), default=math.inf)
     needed = math.ceil(_SUBSTEPS_IN_A_DELAY * rig.time_step / shortest)
-    return min(max(rig.substeps, needed), _FINEST * rig.substeps)
+    return min(max(least, needed), _FINEST * rig.substeps)
