@@ -238,11 +238,11 @@ def test_bad_input_gets_one_sentence(words, recording, tmp_path, changed, senten
 def test_held_out_rollouts_come_from_the_same_file_or_another(recording, tmp_path):
     other = tmp_path / "other.csv"
     pendulum_recording(num_rollouts=2, num_steps=50).to_csv(other)
-    fitted, held_out = resolve_rollouts([recording], "1,3", None)
+    fitted, held_out = resolve_rollouts([recording], "1,3")
     assert (len(fitted), len(held_out)) == (2, 2)
-    fitted, held_out = resolve_rollouts([recording], "", other)
+    fitted, held_out = resolve_rollouts([recording], holdout_data=other)
     assert (len(fitted), len(held_out)) == (4, 2)
-    assert resolve_rollouts([recording], "", None)[1] is None
+    assert resolve_rollouts([recording])[1] is None
 
 
 def test_an_ambiguous_verdict_is_printed_with_what_to_record_next(monkeypatch, tmp_path):

@@ -64,7 +64,7 @@ def main():
     from npdr_ppl.engines import bullet  # noqa: F401
 
     _ = npdr_ppl.MujocoSimulator
-    # Else the first collection in each child would go through, and copy, all that is imported.
+    # Without this, the first collection of garbage in each child copies the memory of all modules.
     gc.collect()
     gc.freeze()
     print("ready", flush=True)

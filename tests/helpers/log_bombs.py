@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from tests.helpers.tree_bombs import deflated_zeros
+from tests.helpers.deflated import deflated_zeros
 
 
 def csv_of_a_long_vector(path):

@@ -1,22 +1,15 @@
 """Small recordings that describe huge ones, as NetCDF and pickle; each writes one file."""
 
 import struct
-import zlib
 
 import h5netcdf
 import h5py
 import numpy as np
 
+from tests.helpers.deflated import deflated_zeros
+
 ROLLOUT = b"cpyrado.sampling.step_sequence\nStepSequence\n"
 F8 = b"cnumpy\ndtype\nX\x02\x00\x00\x00f8K\x00K\x01\x87R"
-
-
-def deflated_zeros(count):
-    """Returns what ``zlib`` makes of so many millions of zeros, without deflating each of them."""
-    compressor = zlib.compressobj(9, wbits=-zlib.MAX_WBITS)
-    million = compressor.compress(bytes(1_000_000)) + compressor.flush(zlib.Z_FULL_FLUSH)
-    checksum = (count * 1_000_000 % 65_521) << 16 | 1  # Adler-32 of zeros
-    return b"\x78\xda" + million * count + compressor.flush() + struct.pack(">I", checksum)
 
 
 def _file(path, **options):

@@ -19,10 +19,10 @@ from npdr_ppl.models.pendulum import pendulum
 from tests.helpers.pendulum_recordings import swinging
 
 
-def learned_from(place, strength, rig="pendulum", condition="outside", rollouts=(0,)):
+def learned_from(place, strength, rig="pendulum", condition="outside", rollouts=None):
     """The truth, the law learned of some of a case's rollouts or all, and how it was checked."""
     case = make_case(rig, condition, (place,), strength=strength, seed=2001)
-    fit = case.fit if rollouts is None else case.fit[list(rollouts)]
+    fit = case.fit if rollouts is None else case.fit[rollouts]
     start = fit_hypothesis(case.model, fit, short_segments(fit))
     model = learned_model(Trials(start.segments), start)
     assert model is not None
@@ -33,7 +33,7 @@ def learned_from(place, strength, rig="pendulum", condition="outside", rollouts=
 
 @pytest.mark.slow
 def test_cubic_damping_is_learned_with_its_coefficient():
-    true, law, found = learned_from(("hinge", "cubic_damping"), 1.0)
+    true, law, found = learned_from(("hinge", "cubic_damping"), 1.0, rollouts=[0])
     assert [term.key for term in law.terms] == ["v³"]
     assert law.coefficients[0] == pytest.approx(-true["damping"], rel=0.1)
     assert all(check.helps for check in found)
@@ -41,7 +41,7 @@ def test_cubic_damping_is_learned_with_its_coefficient():
 
 @pytest.mark.slow
 def test_friction_that_depends_on_the_position_is_learned():
-    true, law, found = learned_from(("hinge", "position_dependent_friction"), 2.0, rollouts=None)
+    true, law, found = learned_from(("hinge", "position_dependent_friction"), 2.0)
     assert law.uses == {"q", "v"}
     assert all(term.is_dry for term in law.terms)
     (number,) = [shape.value for term in law.terms for shape in term.shapes]
@@ -51,7 +51,7 @@ def test_friction_that_depends_on_the_position_is_learned():
 
 @pytest.mark.slow
 def test_an_error_of_a_sensor_is_learned_at_the_sensor():
-    true, law, found = learned_from(("angle", "eccentric_encoder"), 0.3, rollouts=(0, 1))
+    true, law, found = learned_from(("angle", "eccentric_encoder"), 0.3, rollouts=[0, 1])
     assert law.port.name == "angle"
     assert float(torch.tensor(law.coefficients).norm()) == pytest.approx(
         true["amplitude"], rel=0.3
@@ -61,7 +61,7 @@ def test_an_error_of_a_sensor_is_learned_at_the_sensor():
 
 @pytest.mark.slow
 def test_a_command_that_is_stronger_one_way_is_learned_as_a_function_of_the_command():
-    true, law, _ = learned_from(("torque", "asymmetric_gain"), 2.0)
+    true, law, _ = learned_from(("torque", "asymmetric_gain"), 2.0, rollouts=[0])
     assert law.formula.endswith(("|u|", "|τ|"))
     assert law.coefficients[0] == pytest.approx(true["difference"], rel=0.15)
 
@@ -101,7 +101,7 @@ def test_what_the_catalogue_names_is_not_learned():
 
 @pytest.mark.slow
 def test_hysteresis_is_learned_with_the_motion_before_each_segment():
-    true, law, found = learned_from(("hinge", "bouc_wen_hysteresis"), 1.0)
+    true, law, found = learned_from(("hinge", "bouc_wen_hysteresis"), 1.0, rollouts=[0])
     (term,) = (term for term in law.terms if term.memory is not None)
     assert term.memory is not None and term.memory.symbol == "bend"
     width = next(shape.value for shape in term.shapes if shape.name == "width")
@@ -119,7 +119,7 @@ def test_hysteresis_is_learned_with_the_motion_before_each_segment():
 )
 def test_a_command_that_is_late_or_rings_is_learned_with_its_time(port, effect, symbol, name):
     true, law, found = learned_from(
-        (port, effect), 0.5, rig="emps", condition="one", rollouts=(0, 1)
+        (port, effect), 0.5, rig="emps", condition="one", rollouts=[0, 1]
     )
     assert law.port.name == "voltage"
     (term,) = (t for t in law.terms if t.memory is not None and t.memory.symbol == symbol)
@@ -131,7 +131,7 @@ def test_a_command_that_is_late_or_rings_is_learned_with_its_time(port, effect, 
 @pytest.mark.slow
 def test_a_wave_in_time_is_learned_with_its_frequency():
     true, law, found = learned_from(
-        ("hinge", "periodic_disturbance"), 1.0, rig="pendulum", condition="one"
+        ("hinge", "periodic_disturbance"), 1.0, rig="pendulum", condition="one", rollouts=[0]
     )
     (frequency,) = (s.value for t in law.terms for s in t.shapes if s.name == "frequency")
     assert frequency == pytest.approx(true["frequency"], rel=0.01)
