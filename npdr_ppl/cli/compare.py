@@ -89,7 +89,7 @@ def compare(
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
     options = data_options(embedding, segment_length, initial_state, precision, noise, strict)
-    train, test = resolve_rollouts(data, holdout, holdout_data, mapping)
+    train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     with (
         resumable(f"the same command again continues the comparison in {out}."),
         reporter(False if quiet else None) as report,

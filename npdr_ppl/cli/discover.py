@@ -141,7 +141,7 @@ def discover(
     from npdr_ppl.run_files import claimed, reading_back
 
     chosen = resolve_effects(resolve_model(model), effect or [])
-    train, test = resolve_rollouts(data, holdout, holdout_data, mapping)
+    train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     options = data_options(None, segment_length, initial_state, precision, noise, strict)
     search = DiscoveryOptions(
         effects=tuple(named_effects([candidates])) if candidates else None,

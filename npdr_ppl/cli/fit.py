@@ -92,7 +92,7 @@ def fit(
     chosen = resolve_effects(resolve_model(model), effect or [])
     method, features = resolve_backend(backend, embedding)
     options = data_options(features, segment_length, initial_state, precision, noise, strict)
-    train, test = resolve_rollouts(data, holdout, holdout_data, mapping)
+    train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     with (
         resumable(f"the same command again continues the run in {out}."),
         reporter(False if quiet else None) as report,

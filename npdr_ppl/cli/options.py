@@ -117,7 +117,10 @@ HoldoutOption = Annotated[
 ]
 HoldoutDataOption = Annotated[
     Path | None,
-    typer.Option(help="File of held-out rollouts; best with another excitation."),
+    typer.Option(
+        help="File whose rollouts are all held out to test on, instead of --holdout; best with "
+        "other commands."
+    ),
 ]
 BackendOption = Annotated[
     str,

@@ -112,6 +112,7 @@ def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:
 def resolve_rollouts(
     paths: Sequence[Path],
     holdout: str = "",
+    *,
     holdout_data: Path | None = None,
     mapping: Path | None = None,
 ) -> tuple[Any, Any]:
