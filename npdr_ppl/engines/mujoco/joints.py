@@ -5,12 +5,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.ports import ForcePort
 from npdr_ppl.language.effect_context import Joint
 
 __all__ = ["JointStates"]
+
+Array = NDArray[np.float64]
 
 
 class JointStates:
@@ -47,15 +50,32 @@ class JointStates:
             positions: Position of each, ``(N,)``.
             velocities: Velocity of each, ``(N,)``.
         """
-        inertia = np.zeros((len(self._inertia), self._size, self._size))
-        values = self._inertia[:, self._entries]
-        inertia[:, self._rows, self._columns] = values
-        inertia[:, self._columns, self._rows] = values
-        # The matrix of a lost simulation may be singular; this must not stop the others.
-        inverse = torch.linalg.inv_ex(torch.from_numpy(inertia)).inverse
+        inertia = np.zeros((self._size, self._size, len(self._inertia)))
+        values = self._inertia[:, self._entries].T
+        inertia[self._rows, self._columns] = values
+        inertia[self._columns, self._rows] = values
+        inverse = torch.from_numpy(_inverse(inertia))
         acceleration = torch.from_numpy(self._acceleration.copy())
         drive = torch.from_numpy(self._drive.copy())
         return tuple(
-            Joint(q, v, acceleration[:, i], inverse[:, i, i], drive[:, i])
+            Joint(q, v, acceleration[:, i], inverse[i, i], drive[:, i])
             for q, v, i in zip(positions, velocities, self._velocities, strict=True)
         )
+
+
+def _inverse(matrices: Array) -> Array:
+    """Returns the inverses of positive definite matrices, ``(n, n, N)``; overwrites its argument.
+
+    Each row is swept once for all matrices (Goodnight 1979, A tutorial on the SWEEP operator),
+    which takes a fraction of the time of one LAPACK call per small matrix. The matrix of a lost
+    simulation may be singular; its inverse is not finite, and the others do not change.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for k in range(len(matrices)):
+            pivot, column = matrices[k, k].copy(), matrices[:, k].copy()
+            row = matrices[k] / pivot
+            matrices -= column[:, None] * row
+            matrices[:, k] = -column / pivot
+            matrices[k] = row
+            matrices[k, k] = 1.0 / pivot
+    return matrices
