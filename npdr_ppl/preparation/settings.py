@@ -84,9 +84,8 @@ class SegmentFitSettings:
         near_factors: Multiples of the last successful damping that are tried first.
         far_factors: Multiples that are tried if the near ones gain less than seems possible.
         good_share: A step with the least of the near dampings is taken without trying the others
-            if it reduces the objective by at least this share of what it would with linear residuals,
-            a usual limit (Moré 1983, Recent developments in algorithms and software for trust region
-            methods).
+            if its gain is at least this share of that with linear residuals. A quarter is usual
+            (Moré 1983, Recent developments in algorithms and software for trust region methods).
         rough_gain: Rough steps end when no step can reduce the objective by more than this share.
         settled_scale: Rough steps end only when the last step has kept each channel's scale at
             this share of its previous value or more.
@@ -140,13 +139,13 @@ class SegmentFitSettings:
         """Checks the values; raises ``ValueError``."""
         check_range(self, *self.damping_limits, "first_damping")
         check_range(self, 1e-8, 1e8, "near_factors", "far_factors")
-        check_range(self, 0.0, 1.0, "good_share", "rough_gain", "settled_scale")
+        check_range(self, 0.0, 1.0, "rough_gain", "settled_scale")
         check_range(self, 1e-3, 8.0, "longest_step", "largest_coordinate")
         check_range(self, 0.0, math.inf, "least_gain", "initial_state_restarts")
         check_range(self, 0.0, math.inf, "restart_distances", "wide_restart_distances")
         check_range(self, 1.0, math.inf, "outlier_misfit")
         check_range(self, 0, 100, "restart_directions", "most_restarts", "most_updates")
-        check_range(self, 0.0, math.inf, "least_ratio")
+        check_range(self, 0.0, math.inf, "least_ratio", "good_share")
 
 
 @dataclass(frozen=True)
