@@ -21,8 +21,8 @@ __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 class SensorLowPass(SensorEffect):
     """ẏ = (x − y)/T: a filtered measurement, e.g. a velocity derived from an encoder.
 
-    Exact for velocities that are linear between samples and for positions that are parabolic. The
-    measurement therefore lags by T at any sampling rate, as that of a driver that filters the
+    Exact for a value that follows its bend; see :meth:`SensorEffect.read_bent`. The measurement
+    therefore lags by T at any sampling rate, as that of a driver that filters the
     encoder's differences. At a segment's start the filter's output is the measurement there. If
     one driver filters several channels, attach it to the group, ``"arm_velocity,pole_velocity"``.
     """
@@ -30,6 +30,7 @@ class SensorLowPass(SensorEffect):
     id = "sensor_low_pass"
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
     per_recording = ("time_constant",)
+    needs_bend = True
     spans = ("joint", "rate", "rates", "all")
     law = "ẏ = (x − y)/T"
     equivalence = (FIRST_ORDER_LAG,)
@@ -41,35 +42,39 @@ class SensorLowPass(SensorEffect):
         return {"time_constant": dist.Uniform(0.0, 0.03)}
 
     def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> Any:
-        """Returns the weights in the next measurement, and the filter's output and past values.
+        """Returns the weights in the next measurement, the filter's output and the true value.
 
-        There are weights for the true value, for the previous one and for the output. A position
-        has two more for the curvature. The first of these applies to the next measurement only; it
-        is zero, because the value before is unknown. The second one applies to all later ones.
+        There are weights for the true value, for the one before it, for the output, and for the
+        bend.
         """
         time_constant = start.parameters["time_constant"]
         decay = remaining(time_constant, start.time_step)
         steps = time_constant / start.time_step
         trailing = steps * (1.0 - decay)
-        shares = 1.0 - trailing, trailing - decay, decay
-        bends = () if start.is_rate else (0.0 * steps, (steps + 0.5) * trailing - steps)
-        shares, bends = (
-            tuple(share.expand(value.shape) for share in group) for group in (shares, bends)
-        )
-        return shares, bends, (reading, value, value)
+        of_bend = 2.0 * (steps - (steps + 0.5) * trailing)
+        weights = 1.0 - trailing, trailing - decay, decay, of_bend
+        return tuple(weight.expand(value.shape) for weight in weights), (reading, value)
 
     def read(
         self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Tensor, Any]:
         """Returns the filter's output, and the memory with the true value."""
-        shares, bends, (output, last, previous) = memory
-        reading = torch.addcmul(shares[0] * value, shares[1], last)
-        reading = torch.addcmul(reading, shares[2], output)
-        if bends:
-            bend, bends = bends[0], (bends[1], bends[1])
-            curvature = torch.add(value, last, alpha=-2.0) + previous
-            reading = torch.addcmul(reading, bend, curvature)
-        return reading, (shares, bends, (reading, value, last))
+        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
+
+    def read_bent(
+        self,
+        value: Tensor,
+        bend: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Any,
+        time_step: float,
+    ) -> tuple[Tensor, Any]:
+        """Returns the filter's output, and the memory with the true value."""
+        weights, (output, last) = memory
+        reading = weights[0] * value
+        for weight, part in zip(weights[1:], (last, output, bend), strict=True):
+            reading = torch.addcmul(reading, weight, part)
+        return reading, (weights, (reading, value))
 
 
 class EncoderBias(SensorEffect):

@@ -16,25 +16,25 @@ from npdr_ppl.models.effects.references import LJUNG_1999
 
 __all__ = ["ClockSkew", "SensorDelay"]
 
+_Past = tuple[tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...], tuple[Tensor, ...]]
+"""Weights of values, weights of bends, past values and past bends."""
+
 
 def _on_line(age: Tensor) -> Tensor:
     """Returns the weight of a value in the value ``age`` steps before it, on a line."""
     return (1.0 - age.abs()).clamp_min(0.0)
 
 
-def _on_parabola(age: Tensor) -> Tensor:
-    """Returns the same on the parabola through the two adjacent values and the one before them."""
-    share = torch.where(age >= 0.0, (1.0 - age) * (1.0 - 0.5 * age), (1.0 + age) * (1.0 - age))
-    share = torch.where(age >= -1.0, share, 0.5 * (2.0 + age) * (1.0 + age))
-    return torch.where((age > -2.0) & (age < 1.0), share, 0.0)
+def _of_bend(age: Tensor) -> Tensor:
+    """Returns the weight of a step's bend in the value ``age`` steps before the step's end."""
+    return (age * (1.0 - age)).clamp_min(0.0)
 
 
 class SensorDelay(SensorEffect):
     """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
 
-    Between steps of length h a velocity is interpolated linearly, because it has kinks where
-    commands change. A position is interpolated by the parabola through the two adjacent values and
-    the one before. Attach it to all channels that share the delay.
+    Between steps a value follows its bend; see :meth:`SensorEffect.read_bent`. Attach it to all
+    channels that share the delay.
 
     The measurement at a segment's start is the state d earlier. The segment's initial state is
     computed from it by the simulator without its effects, under the commands of that time. The
@@ -46,6 +46,7 @@ class SensorDelay(SensorEffect):
     parameters = (Parameter("delay", "s", 0.0, "delay d"),)
     is_smooth = False
     needs_past = True
+    needs_bend = True
     spans = ("joint", "rates", "all")
     law = "y(t − d)"
     equivalence = (LATENCY,)
@@ -57,49 +58,56 @@ class SensorDelay(SensorEffect):
         return {"delay": dist.Uniform(0.0, 0.03)}
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the number of steps in the longest delay, and one for the curvature."""
+        """Returns the number of steps that begin within the longest delay, and one."""
         return math.floor(float(parameters["delay"].detach().max()) / time_step) + 2
 
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
         """Returns −d."""
         return -parameters["delay"]
 
-    def initial_memory(
-        self, value: Tensor, reading: Tensor, start: Start
-    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """Returns the weights of x_k, x_{k−1}, …, and the past values, latest first."""
-        steps = start.parameters["delay"] / start.time_step
-        weight = _on_line if start.is_rate else _on_parabola
-        weights = tuple(weight(steps - j).expand(value.shape) for j in range(start.history + 1))
-        return weights, (value, *start.past(value)[:-1])
+    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> _Past:
+        """Returns the weights of x_k, x_{k−1}, … and of the bends, and both, latest first."""
+        steps, num = start.parameters["delay"] / start.time_step, start.history
+        weights = tuple(_on_line(steps - j).expand(value.shape) for j in range(num + 1))
+        of_bends = tuple(_of_bend(steps - j).expand(value.shape) for j in range(num))
+        bends = (*start.bends, *(torch.zeros_like(value) for _ in range(num)))
+        return weights, of_bends, (value, *start.past(value)[:-1]), bends[: num - 1]
 
     def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: _Past, time_step: float
+    ) -> tuple[Tensor, _Past]:
+        """Returns the value a time d earlier."""
+        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
+
+    def read_bent(
         self,
         value: Tensor,
+        bend: Tensor,
         parameters: Mapping[str, Tensor],
-        memory: tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
+        memory: _Past,
         time_step: float,
-    ) -> tuple[Tensor, tuple[tuple[Tensor, ...], tuple[Tensor, ...]]]:
+    ) -> tuple[Tensor, _Past]:
         """Returns the value a time d earlier."""
-        weights, past = memory
-        reading = weights[0] * value
-        for weight, earlier in zip(weights[1:], past, strict=True):
-            reading = torch.addcmul(reading, weight, earlier)
-        return reading, (weights, (value, *past[:-1]))
+        weights, of_bends, past, bends = memory
+        past, bends = (value, *past), (bend, *bends)
+        reading = torch.zeros_like(value)
+        for weight, part in zip((*weights, *of_bends), (*past, *bends), strict=True):
+            reading = torch.addcmul(reading, weight, part)
+        return reading, (weights, of_bends, past[:-1], bends[:-1])
 
 
 class ClockSkew(SensorEffect):
     """y(t) = x(t (1 + κ)): measurements timed by a clock with another rate than the commands'.
 
-    κ t is small. A position therefore follows from the parabola through its last three values. A
-    velocity follows from the line through two, because it has kinks where commands change. Both
-    clocks agree when a rollout begins; measurements at a segment's start are κ t ahead.
+    κ t is small. A value therefore follows from that of the last step and from its bend; see
+    :meth:`SensorEffect.read_bent`. Both clocks agree when a rollout begins; measurements at a
+    segment's start are κ t ahead.
     """
 
     id = "clock_skew"
     port_kinds = ("clock",)
     parameters = (Parameter("skew", "1", 0.0, "relative skew κ"),)
-    needs_past = True
+    needs_bend = True
     law = "t (1 + κ)"
     excitation = "long_run"
     reference = LJUNG_1999
@@ -107,10 +115,6 @@ class ClockSkew(SensorEffect):
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Normal; 300 ppm."""
         return {"skew": dist.Normal(0.0, 3e-4)}
-
-    def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns 2."""
-        return 2
 
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:
         """Returns κ t."""
@@ -122,22 +126,33 @@ class ClockSkew(SensorEffect):
         """Removes the time's scale."""
         return rate / (1.0 + parameters["skew"])
 
-    def initial_memory(self, value: Tensor, reading: Tensor, start: Start) -> tuple[Tensor, ...]:
-        """Returns the time, the curvature's weight, the current value and the one before it."""
-        smooth = torch.full_like(value, 0.0 if start.is_rate else 1.0)
-        return start.time, smooth, value, start.past(value)[0]
+    def initial_memory(
+        self, value: Tensor, reading: Tensor, start: Start
+    ) -> tuple[Tensor, Tensor]:
+        """Returns the time and the present value."""
+        return start.time, value
 
     def read(
         self,
         value: Tensor,
         parameters: Mapping[str, Tensor],
-        memory: tuple[Tensor, ...],
+        memory: tuple[Tensor, Tensor],
         time_step: float,
-    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """Returns the value κ t ahead."""
-        before, smooth, last, previous = memory
+        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
+
+    def read_bent(
+        self,
+        value: Tensor,
+        bend: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: tuple[Tensor, Tensor],
+        time_step: float,
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Returns the value κ t ahead."""
+        before, last = memory
         time = before + time_step
         lead = parameters["skew"] * time / time_step
-        curvature = smooth * (value - 2.0 * last + previous)
-        ahead = lead * (value - last + 0.5 * (1.0 + lead) * curvature)
-        return value + ahead, (time, smooth, value, last)
+        reading = value + lead * (value - last - (1.0 + lead) * bend)
+        return reading, (time, value)

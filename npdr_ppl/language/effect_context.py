@@ -60,8 +60,8 @@ class Start(NamedTuple):
         changes: Differences of a sensor channel's true value one step before the start, two
             steps before and so on, as the simulator without its effects predicts. Empty for
             effects that are not on sensors or do not request it.
-        is_rate: Whether the value is a measured velocity. With commands that are constant within
-            a step, velocities have kinks between steps, while positions are smooth.
+        bends: Bends of the true value in the last step before the start, the one before and so
+            on; see :meth:`SensorEffect.read_bent`. Empty for effects that do not request them.
         displacements: How far a joint moved in each interval before the start, oldest first, as
             recorded. Empty for effects that are not on joints or do not request it, and where no
             recording tells: in an episode, or if the joint's position was not measured.
@@ -73,7 +73,7 @@ class Start(NamedTuple):
     parameters: Mapping[str, Tensor]
     history: int = 0
     changes: tuple[Tensor, ...] = ()
-    is_rate: bool = False
+    bends: tuple[Tensor, ...] = ()
     displacements: tuple[Tensor, ...] = ()
     interval: float = 0.0
 

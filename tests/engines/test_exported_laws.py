@@ -100,17 +100,16 @@ def test_refined_steps_are_taken(arm, tmp_path):
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.0137])
-@pytest.mark.parametrize("is_rate", [False, True])
-def test_a_delay_is_the_same_in_shorter_steps_than_those_of_the_reset(delay, is_rate):
+def test_a_delay_is_the_same_in_shorter_steps_than_those_of_the_reset(delay):
     sensor, command = SensorDelayLaw("x", delay), InputDelayLaw("motor", delay)
-    sensor.reset(1.0, 0.01, is_rate)
+    sensor.reset(1.0, 0.01)
     command.settle(1.0, 0.01)
     step = 0.002
     for number in range(1, 30):
         time = number * step
         # A position that rests, and then moves at 3 rad/s.
-        measured = sensor.read(1.0 + 3.0 * time, time, step)
-        if not -step < time - delay < step:  # where the parabola meets the kink
+        measured = sensor.read(1.0 + 3.0 * time, 0.0, time, step)
+        if not -step < time - delay < step:  # where a step has the kink
             assert measured == pytest.approx(1.0 + 3.0 * max(time - delay, 0.0))
         assert command.act(1.0, step)[0] == pytest.approx(1.0)
 

@@ -120,7 +120,7 @@ def test_every_form_of_a_learned_error_is_the_same_at_every_value(arm):
         values = torch.linspace(-1.2, 1.2, 25, dtype=torch.float64)
         own = {name.rpartition(".")[2]: value for name, value in given.items()}
         wanted, _ = effect.read(values, own, None, 0.01)
-        found = [law.read(float(value), 0.0, 0.01) for value in values]
+        found = [law.read(float(value), 0.0, 0.0, 0.01) for value in values]
         assert found == pytest.approx(wanted.tolist(), abs=1e-12), term.key
 
 

@@ -388,7 +388,7 @@ def test_a_filtered_reading_is_the_continuous_filter_of_the_line_between_samples
     true = np.interp(times, [0.0, 0.05, 0.2, 1.0], [0.0, 3.0, -1.0, 5.0])
     expected = lsim(([1.0], [float(time_constant), 1.0]), true, times, X0=[0.0])[1]
     values, own = torch.tensor(true), {"time_constant": time_constant}
-    start = Start(torch.zeros(()), time_step, own, is_rate=True)
+    start = Start(torch.zeros(()), time_step, own)
     memory = law.initial_memory(values[0], torch.tensor(0.0).double(), start)
     for value, reading in zip(values[1:], expected[1:], strict=True):
         output, memory = law.read(value, own, memory, time_step)
@@ -398,9 +398,11 @@ def test_a_filtered_reading_is_the_continuous_filter_of_the_line_between_samples
 def test_a_filtered_position_trails_a_parabola_as_the_continuous_filter_does():
     law, own = SensorLowPass("angle"), {"time_constant": torch.tensor(0.012).double()}
     step, (a, b) = 0.02, (0.3, -4.0)  # x = a t + ½ b t², whose filtered value is known
+    bend = torch.tensor(-0.5 * b * step**2)
     memory = law.initial_memory(*torch.zeros(2).double(), Start(torch.zeros(()), step, own))
     for k in range(1, 80):
         t, lag = k * step, 0.012
-        output, memory = law.read(torch.tensor(a * t + 0.5 * b * t * t), own, memory, step)
+        value = torch.tensor(a * t + 0.5 * b * t * t)
+        output, memory = law.read_bent(value, bend, own, memory, step)
     # After the transient: x(t) − T ẋ(t) + T² ẍ.
     assert output.item() == pytest.approx(a * t + 0.5 * b * t * t - lag * (a + b * t) + lag**2 * b)

@@ -23,6 +23,8 @@ class State(NamedTuple):
         action_memory: Own state of each action effect.
         past_commands: Past commands that each action effect may need, latest first.
         sensor_memory: Own state of each sensor effect for each of its channels.
+        past_readings: True sensor values at the state's time and one step earlier, if a sensor
+            effect needs them.
         servo_memory: Own state of each effect inside a servo.
     """
 
@@ -32,6 +34,7 @@ class State(NamedTuple):
     action_memory: tuple[Any, ...] = ()
     past_commands: tuple[Components, ...] = ()
     sensor_memory: tuple[tuple[Any, ...], ...] = ()
+    past_readings: tuple[Components, ...] = ()
     servo_memory: tuple[Tensor | None, ...] = ()
 
 

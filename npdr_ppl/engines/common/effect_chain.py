@@ -38,6 +38,8 @@ class EffectChain(ABC):
             :func:`needed_histories`.
         force_step: Seconds between two evaluations of the force effects; ``None`` for
             ``time_step``.
+        rate_lag: How far velocities are ahead of the positions' derivative, as a share of a step;
+            ``None`` if it is unknown.
 
     Attributes:
         forces: The effects on forces.
@@ -53,6 +55,7 @@ class EffectChain(ABC):
         histories: tuple[int, ...],
         *,
         force_step: float | None = None,
+        rate_lag: float | None = None,
     ) -> None:
         self.simulator = simulator
         self.joints = joints
@@ -63,7 +66,7 @@ class EffectChain(ABC):
         )
         self.actions = ActionEffects(simulator, histories, time_step)
         of_sensors = histories[len(self.actions.effects) :]
-        self.sensors = SensorEffects(simulator, of_sensors, time_step)
+        self.sensors = SensorEffects(simulator, of_sensors, time_step, rate_lag)
 
     @property
     def position_channels(self) -> tuple[str | None, ...]:
@@ -174,7 +177,7 @@ class EffectChain(ABC):
             ),
             self.actions.initial_memory(commands, tables, earlier),
             self.actions.initial_past(commands),
-            self._sensor_memory(
+            *self._sensor_memory(
                 positions,
                 velocities,
                 tables,
@@ -194,11 +197,11 @@ class EffectChain(ABC):
         readings: tuple[Tensor | None, ...],
         time: Tensor,
         is_held: Tensor | None,
-    ) -> tuple[tuple[Any, ...], ...]:
-        """Returns the sensor effects' own state at the start; see :meth:`start`."""
+    ) -> tuple[tuple[tuple[Any, ...], ...], tuple[Components, ...]]:
+        """Returns the sensor effects' own state, and past values; see :meth:`start`."""
         # Only values that an effect needs are computed, because short simulations start often.
         if not self.sensors.effects:
-            return ()
+            return (), ()
         true = self.true_readings(positions, velocities, tables)
         changes: dict[int, tuple[Tensor, ...]] = {}
         if num_before := self.sensors.num_before:
@@ -217,7 +220,8 @@ class EffectChain(ABC):
                     column: tuple(change.where(~is_held, 0.0) for change in own)
                     for column, own in changes.items()
                 }
-        return self.sensors.initial_memory(true, changes, readings, tables, time)
+        memory = self.sensors.initial_memory(true, changes, readings, tables, time)
+        return memory, self.sensors.initial_past(true, changes)
 
     def advance(
         self,

@@ -53,8 +53,16 @@ class MujocoStepper(EffectChain):
     ) -> None:
         self.substeps = simulator.num_substeps(time_step)
         self._engine_step = time_step / self.substeps
+        mujoco: Any = importlib.import_module("mujoco")
+        is_fourth = simulator.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         super().__init__(
-            simulator, simulator.joints, time_step, histories, force_step=self._engine_step
+            simulator,
+            simulator.joints,
+            time_step,
+            histories,
+            force_step=self._engine_step,
+            # The other integrators advance positions with the velocities at the end of a step.
+            rate_lag=0.0 if is_fourth else 0.5 / self.substeps,
         )
         self.simulator: MujocoMechanism = simulator
         self.forces.effects = [f for f in self.forces.effects if not simulator.is_native(f[1])]

@@ -18,6 +18,8 @@ from npdr_ppl.language.effect_context import Joint
 
 __all__ = ["Stepper"]
 
+_LEAST_ORDER_FOR_BENDS = 3
+
 
 class Stepper(EffectChain):
     """Advances states by one time step under the effects attached to a simulator.
@@ -33,7 +35,16 @@ class Stepper(EffectChain):
         self, simulator: MechanicalSystem, time_step: float, histories: tuple[int, ...]
     ) -> None:
         substep = time_step / simulator.substeps
-        super().__init__(simulator, simulator.joints, time_step, histories, force_step=substep)
+        # Positions of lower order do not tell how the velocity bends.
+        rate_lag = 0.0 if simulator.integrator.order >= _LEAST_ORDER_FOR_BENDS else None
+        super().__init__(
+            simulator,
+            simulator.joints,
+            time_step,
+            histories,
+            force_step=substep,
+            rate_lag=rate_lag,
+        )
         self.simulator: MechanicalSystem = simulator
         self._substep = substep
         # With a first-order integrator, moments would not make the positions more accurate.

@@ -18,11 +18,13 @@ class SensorEffect(Effect):
 
     Attributes:
         needs_past: Whether its initial memory needs :attr:`Start.changes`.
+        needs_bend: Whether :meth:`read_bent` is called in place of :meth:`read`.
         spans: The channels that one device can affect with the same parameters.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_past: ClassVar[bool] = False
+    needs_bend: ClassVar[bool] = False
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
 
     @property
@@ -84,3 +86,25 @@ class SensorEffect(Effect):
         self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
     ) -> tuple[Tensor, Any]:
         """Returns the measurement after a step, and the next memory."""
+
+    def read_bent(
+        self,
+        value: Tensor,
+        bend: Tensor,
+        parameters: Mapping[str, Tensor],
+        memory: Any,
+        time_step: float,
+    ) -> tuple[Tensor, Any]:
+        """Returns the measurement after a step whose motion is known, and the next memory.
+
+        By default it is :meth:`read`, which takes the motion for a straight line.
+
+        Args:
+            value: True value after the step.
+            bend: b, with which the true value went from x₀ to x₁ along
+                (1 − s) x₀ + s x₁ + s (1 − s) b, s from 0 to 1.
+            parameters: The effect's parameters by short name.
+            memory: The effect's own state.
+            time_step: Seconds per step.
+        """
+        return self.read(value, parameters, memory, time_step)

@@ -49,6 +49,9 @@ class LawRunner:
         self.sensors = [law for law in laws if isinstance(law, SensorLaw)]
         self.channels = {name: self._address(*place) for name, place in channels.items()}
         self.rates = {name for name, place in channels.items() if place[0] == "qvel"}
+        self.partners = _partners(model, channels)
+        self.last: dict[str, float] = {}
+        self.previous: dict[str, float] = {}
         self.needs_dynamics = any(law.needs_dynamics for law, *_ in self.forces)
         self.friction = model.dof_frictionloss
         low, high = model.actuator_ctrlrange.T
@@ -72,10 +75,10 @@ class LawRunner:
         for law, _ in self.servos:
             law.reset()
         values = self._true_values(data)
+        self.last, self.previous = dict(values), dict(values)
         step = self.substeps * float(self.model.opt.timestep)
         for law in self.sensors:
-            is_rate = law.channel in self.rates
-            values[law.channel] = law.reset(values[law.channel], step, is_rate)
+            values[law.channel] = law.reset(values[law.channel], step)
         return values
 
     def step(self, data: Any, commands: Any, substeps: int | None = None) -> dict[str, float]:
@@ -95,10 +98,30 @@ class LawRunner:
         for k in range(count):
             data.ctrl[:] = means + slope * moments * (k - 0.5 * (count - 1))
             self._substep(data)
-        values = self._true_values(data)
+        true = self._true_values(data)
+        values = dict(true)
         for law in self.sensors:
-            values[law.channel] = law.read(values[law.channel], float(data.time), step)
+            name = law.channel
+            bend = self._bend(name, true, step, count)
+            values[name] = law.read(values[name], bend, float(data.time), step)
+        self.last, self.previous = true, self.last
         return values
+
+    def _bend(self, name: str, true: Mapping[str, float], step: float, count: int) -> float:
+        """Returns how a channel deviated from a straight line in the last step."""
+        last, partner = self.last, self.partners.get(name)
+        change = true[name] - last[name]
+        if name not in self.rates:
+            if partner is None:
+                return 0.5 * (last[name] - self.previous[name] - change)
+            return 0.5 * step * (last[partner] - true[partner])
+        if partner is None:
+            return 0.0
+        # All integrators but this one advance positions with the velocities at a step's end.
+        is_fourth = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        lag = 0.0 if is_fourth else 0.5 / count
+        mean = last[name] + (0.5 + lag) * change
+        return 6.0 * ((true[partner] - last[partner]) / step - mean)
 
     def _after_laws(self, commands: Any, step: float) -> tuple[Any, Any]:
         """Returns mean and moment of each command after the laws, for a step in seconds."""
@@ -181,3 +204,20 @@ class LawRunner:
             mujoco.mj_fwdVelocity(self.model, data)
             mujoco.mj_sensorVel(self.model, data)
         return {name: float(getattr(data, a)[i]) for name, (a, i) in self.channels.items()}
+
+
+def _partners(model: Any, channels: Mapping[str, Channel]) -> dict[str, str]:
+    """Returns the rate of each position among the channels, and the position of each rate."""
+    kinds = mujoco.mjtJoint
+    names = {place: name for name, place in channels.items()}
+    result = {}
+    for (array, joint, component), name in names.items():
+        rate = names.get(("qvel", joint, component))
+        if array != "qpos" or rate is None:
+            continue
+        kind = int(model.joint(joint).type[0])
+        # Of a free joint, only the first three components of the velocity are rates.
+        is_scalar = kind in (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE))
+        if is_scalar or (kind == int(kinds.mjJNT_FREE) and component < 3):
+            result |= {name: rate, rate: name}
+    return result

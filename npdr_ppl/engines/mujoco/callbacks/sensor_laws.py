@@ -27,21 +27,22 @@ class SensorLaw:
 
     channel: str
 
-    def reset(self, value: float, step: float, is_rate: bool) -> float:
+    def reset(self, value: float, step: float) -> float:
         """Sets the own state at the start, at which the robot rests; returns the measurement.
 
         Args:
             value: True value.
             step: Seconds per control step.
-            is_rate: Whether it is a velocity, which has kinks between steps.
         """
-        return self.read(value, 0.0, step)
+        return self.read(value, 0.0, 0.0, step)
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the measurement after a step.
 
         Args:
             value: True value.
+            bend: b, with which the true value went from x₀ to x₁ along
+                (1 − s) x₀ + s x₁ + s (1 − s) b, s from 0 to 1.
             time: Seconds since the start.
             step: Seconds per control step.
         """
@@ -54,7 +55,7 @@ class EncoderBias(SensorLaw):
 
     offset: float
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the measurement."""
         return value + self.offset
 
@@ -65,7 +66,7 @@ class EncoderScale(SensorLaw):
 
     error: float
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the measurement."""
         return (1.0 + self.error) * value
 
@@ -76,70 +77,59 @@ class Quantisation(SensorLaw):
 
     count: float
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the measurement."""
         return round(value / self.count) * self.count if self.count > 0.0 else value
 
 
 @dataclass
 class SensorLowPass(SensorLaw):
-    """ẏ = (x − y)/T, exact for lines between samples; for positions for parabolas."""
+    """ẏ = (x − y)/T, exact for a value that follows its bend."""
 
     time_constant: float
     output: float = field(default=0.0, init=False, repr=False)
-    past: tuple[float, float] = field(default=(0.0, 0.0), init=False, repr=False)
-    is_rate: bool = field(default=False, init=False, repr=False)
-    is_first: bool = field(default=True, init=False, repr=False)
+    last: float = field(default=0.0, init=False, repr=False)
 
-    def reset(self, value: float, step: float, is_rate: bool) -> float:
+    def reset(self, value: float, step: float) -> float:
         """Sets the output to the value."""
-        self.output, self.past = value, (value, value)
-        self.is_rate, self.is_first = is_rate, True
+        self.output = self.last = value
         return value
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the filter's output."""
         decay, steps = remaining(self.time_constant, step), self.time_constant / step
         trailing = steps * (1.0 - decay)
-        last, previous = self.past
-        output = (1.0 - trailing) * value + (trailing - decay) * last + decay * self.output
-        if not (self.is_rate or self.is_first):
-            bend = (steps + 0.5) * trailing - steps
-            output += bend * (value - 2.0 * last + previous)
-        self.output, self.past, self.is_first = output, (value, last), False
+        output = (1.0 - trailing) * value + (trailing - decay) * self.last + decay * self.output
+        output += 2.0 * (steps - (steps + 0.5) * trailing) * bend
+        self.output, self.last = output, value
         return output
 
 
 @dataclass
 class SensorDelay(SensorLaw):
-    """x(t − d), interpolated on a line for velocities and on a parabola for positions."""
+    """x(t − d), along the bends of the steps."""
 
     delay: float
     past: deque[float] = field(default_factory=deque, init=False, repr=False)
-    is_rate: bool = field(default=False, init=False, repr=False)
+    bends: deque[float] = field(default_factory=deque, init=False, repr=False)
 
-    def reset(self, value: float, step: float, is_rate: bool) -> float:
+    def reset(self, value: float, step: float) -> float:
         """Fills the past with the value."""
         length = math.floor(self.delay / step) + 3
-        self.past, self.is_rate = deque([value] * length, maxlen=length), is_rate
+        self.past = deque([value] * length, maxlen=length)
+        self.bends = deque([0.0] * length, maxlen=length)
         return value
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the value a time d earlier."""
         steps = self.delay / step
-        self.past = lengthened(self.past, math.floor(steps) + 3)
+        length = math.floor(steps) + 3
+        self.past, self.bends = lengthened(self.past, length), lengthened(self.bends, length)
         self.past.appendleft(value)
-        return sum(self.weight(steps - j) * earlier for j, earlier in enumerate(self.past))
-
-    def weight(self, age: float) -> float:
-        """Returns the weight of a value in the value ``age`` steps before it."""
-        if self.is_rate:
-            return max(1.0 - abs(age), 0.0)
-        if not -2.0 < age < 1.0:
-            return 0.0
-        if age >= 0.0:
-            return (1.0 - age) * (1.0 - 0.5 * age)
-        return (1.0 + age) * (1.0 - age) if age >= -1.0 else 0.5 * (2.0 + age) * (1.0 + age)
+        self.bends.appendleft(bend)
+        age, k = steps % 1.0, math.floor(steps)
+        line = (1.0 - age) * self.past[k] + age * self.past[k + 1]
+        return line + age * (1.0 - age) * self.bends[k]
 
 
 @dataclass
@@ -147,18 +137,16 @@ class ClockSkew(SensorLaw):
     """x(t (1 + κ)): measurements timed by a clock with another rate."""
 
     skew: float
-    past: tuple[float, float] = field(default=(0.0, 0.0), init=False, repr=False)
-    is_rate: bool = field(default=False, init=False, repr=False)
+    last: float = field(default=0.0, init=False, repr=False)
 
-    def reset(self, value: float, step: float, is_rate: bool) -> float:
-        """Fills the past with the value."""
-        self.past, self.is_rate = (value, value), is_rate
+    def reset(self, value: float, step: float) -> float:
+        """Keeps the value."""
+        self.last = value
         return value
 
-    def read(self, value: float, time: float, step: float) -> float:
+    def read(self, value: float, bend: float, time: float, step: float) -> float:
         """Returns the value κ t ahead."""
-        last, previous = self.past
         lead = self.skew * time / step
-        bend = 0.0 if self.is_rate else value - 2.0 * last + previous
-        self.past = value, last
-        return value + lead * (value - last + 0.5 * (1.0 + lead) * bend)
+        reading = value + lead * (value - self.last - (1.0 + lead) * bend)
+        self.last = value
+        return reading

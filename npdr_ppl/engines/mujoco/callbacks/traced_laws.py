@@ -126,13 +126,6 @@ class _Others(Mapping[str, Any]):
         raise ModelError("it depends on other joints")
 
 
-class _Unknown:
-    """Whether a channel is a velocity, which the class of a law must not depend on."""
-
-    def __bool__(self) -> bool:
-        raise ModelError("its state begins otherwise for velocities than for positions")
-
-
 class _Memory:
     """A law's own state as a row of numbers.
 
@@ -289,24 +282,27 @@ def _servo(effect: ServoEffect) -> TracedLaw:
 
 
 def _sensor(effect: SensorEffect) -> TracedLaw:
-    if effect.needs_past or type(effect).history is not SensorEffect.history:
-        raise ModelError("it needs earlier values of the measurement")
+    if effect.needs_past or effect.needs_bend or type(effect).history is not SensorEffect.history:
+        raise ModelError("it needs values between steps, or earlier ones")
     recorder = Recorder()
     own = _parameters(effect, recorder)
     value, h = recorder.number("value"), recorder.number("step")
-    start = Start(recorder.number("start"), h, own, is_rate=_Unknown())  # pyright: ignore[reportArgumentType]
+    start = Start(recorder.number("start"), h, own)
     memory = _Memory(effect.initial_memory(value, value, start))
     measured, later = effect.read(value, own, memory.stand_ins(recorder), h)
     lines: list[str] = []
     if memory.leaves:
         lines += _MEMORY
-        lines += ["", "    def reset(self, value: float, step: float, is_rate: bool) -> float:"]
+        lines += ["", "    def reset(self, value: float, step: float) -> float:"]
         lines += ['        """Sets the state at the start; returns the measurement."""']
         lines += _setting(recorder, memory.leaves, _OF_VALUE)
         lines += ["        before = self.memory"]
-        lines += ["        measured = self.read(value, 0.0, step)"]
+        lines += ["        measured = self.read(value, 0.0, 0.0, step)"]
         lines += ["        self.memory = before", "        return measured"]
-    lines += ["", "    def read(self, value: float, time: float, step: float) -> float:"]
+    lines += [
+        "",
+        "    def read(self, value: float, bend: float, time: float, step: float) -> float:",
+    ]
     lines += ['        """Returns the measurement."""']
     statements, texts = _statements(recorder, [measured, *memory.leaves_of(later)], _OF_VALUE)
     lines += [*statements, f"        measured = {texts[0]}"]
