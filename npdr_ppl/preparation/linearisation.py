@@ -34,16 +34,6 @@ class Linearisation:
         )
         return Linearisation(self.residual * ratio, by_parameters, by_starts)
 
-    def residual_after(self, step: Tensor, moves: Tensor) -> Tensor:
-        """Returns the residuals at another point if they are linear, ``(S, N)``.
-
-        Args:
-            step: Difference of the parameters, ``(d,)``.
-            moves: Differences of the offsets, ``(S, m)``.
-        """
-        change = self.by_parameters @ step + (self.by_starts @ moves[..., None])[..., 0]
-        return self.residual - change
-
     def updated(self, residual: Tensor, step: Tensor, moves: Tensor) -> "Linearisation":
         """Returns the linearisation at a nearby point.
 
@@ -58,7 +48,7 @@ class Linearisation:
         """
         both = torch.cat((step.expand(len(moves), -1), moves), dim=-1)[:, None]  # (S, 1, d + m)
         derivatives = torch.cat((self.by_parameters, self.by_starts), dim=-1)
-        missed = (self.residual_after(step, moves) - residual)[..., None]
+        missed = (self.residual - residual)[..., None] - derivatives @ both.mT
         length = both.square().sum(-1, keepdim=True).clamp_min(LINEARISATION.parameter_step**2)
         derivatives = derivatives + missed * (both / length)
         by_parameters, by_starts = derivatives.split((len(step), moves.shape[-1]), dim=-1)

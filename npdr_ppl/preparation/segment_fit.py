@@ -15,7 +15,6 @@ of a Furuta pendulum forced steps so small that its masses did not converge.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -217,7 +216,7 @@ def _restart(
     least, chosen = losses.min(1)  # (n, S)
     outcome = least.sum(-1) + tried.square().sum(-1)
     best = int(outcome.argmin())
-    present = _objective(now.residual, z, offsets)
+    present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
     if float(outcome[best]) > present - SEGMENT_FIT.least_gain:
         return None
     return tried[best], begun[best][chosen[best], torch.arange(len(offsets))]
@@ -239,10 +238,6 @@ def _steps(
 
     Where the simulator has coarser steps, each linearisation and the trials after it take those,
     with what they miss at its point (:meth:`SegmentModel.corrected`).
-
-    The least damped step is taken if it gains much of what linear residuals promise. Otherwise,
-    and where the misfit has local minima, steps with several dampings are tried, and the best is
-    taken.
 
     Derivatives cost most of a step. So a few further steps use those of an earlier point,
     corrected by what the last step has changed (Broyden 1965). Where the misfit has local minima,
@@ -269,9 +264,10 @@ def _steps(
         Parameters, offsets, the scale of the residuals, and the linearisation there, whitened by
         that scale, if it is known.
     """
-    damping = SEGMENT_FIT.first_damping
-    dampings = torch.full((len(offsets),), damping, dtype=torch.float64)
-    smallest, greatest = SEGMENT_FIT.damping_limits
+    damping, dampings = (
+        SEGMENT_FIT.first_damping,
+        torch.full((len(offsets),), SEGMENT_FIT.first_damping).double(),
+    )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
     has_minima = bool((segments.coordinates_with_minima & ~held).any())
     now, model, num_updates, num_linearised = None, segments, 0, 0
@@ -295,7 +291,7 @@ def _steps(
                 break
             now = None
             continue
-        present = _objective(now.residual, z, offsets)
+        present = sum(float(part.square().sum()) for part in (now.residual, offsets, z))
         enough = max(
             SEGMENT_FIT.least_gain / share, SEGMENT_FIT.rough_gain * present if is_rough else 0.0
         )
@@ -311,24 +307,28 @@ def _steps(
                 break
             now = None
             continue
-        tried = None
-        if factors is SEGMENT_FIT.near_factors and not has_minima:
-            least_damped = damping * factors[0], dampings * factors[0]
-            tried = _tried(model, now, z, offsets, scale, held, *least_damped, (1.0,))
-            residual = now.residual_after(tried.z - z, tried.offsets - offsets)
-            expected = present - _objective(residual, tried.z, tried.offsets)
-            if not present - tried.loss >= max(enough, SEGMENT_FIT.good_share * expected):
-                tried = None
-        if tried is None:
-            tried = _tried(model, now, z, offsets, scale, held, damping, dampings, factors)
-        gain = present - tried.loss
+        moves = [step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
+        tried = torch.stack([point for point, _ in moves])
+        begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
+        squares = _squares(model, tried, begun, scale)  # (a, b, S, C)
+        losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
+        least, chosen = losses.min(1)  # (a, S)
+        outcome = least.sum(-1) + tried.square().sum(-1)
+        best = int(outcome.argmin())
+        gain = present - float(outcome[best])
         is_little = gain < enough
         if gain > 0.0:
+            place, every = chosen[best], torch.arange(len(offsets))
             last = z, offsets
-            z, offsets = tried.z, tried.offsets
-            damping = min(max(tried.damping, smallest), greatest)
-            dampings = tried.dampings.clamp(smallest, greatest)
-            present_scale = _scale(segments, tried.squares, scale)
+            z, offsets = tried[best], begun[best][place, every]
+            damping = min(
+                max(damping * factors[best], SEGMENT_FIT.damping_limits[0]),
+                SEGMENT_FIT.damping_limits[1],
+            )
+            dampings = (dampings * torch.tensor(factors).double()[place]).clamp(
+                *SEGMENT_FIT.damping_limits
+            )
+            present_scale = _scale(segments, squares[best][place, every].sum(0), scale)
             before = scale
             if is_rough:
                 scale = present_scale
@@ -359,65 +359,6 @@ def _steps(
     if known is not None and known[0] is z and known[1] is offsets:
         last = known[3].rescaled(known[2] / present_scale)
     return z, offsets, present_scale, last
-
-
-class _Tried(NamedTuple):
-    """The best of the steps with several dampings.
-
-    Attributes:
-        z: Parameters after it, ``(d,)``.
-        offsets: Offsets of the initial states, ``(S, m)``.
-        loss: The objective there.
-        squares: Sums of squared whitened residuals by channel, ``(C,)``.
-        damping: Damping of the parameters.
-        dampings: Damping of the offsets of each segment, ``(S,)``.
-    """
-
-    z: Tensor
-    offsets: Tensor
-    loss: float
-    squares: Tensor
-    damping: float
-    dampings: Tensor
-
-
-def _tried(
-    model: SegmentModel,
-    now: Linearisation,
-    z: Tensor,
-    offsets: Tensor,
-    scale: Tensor,
-    held: Tensor,
-    damping: float,
-    dampings: Tensor,
-    factors: tuple[float, ...],
-) -> _Tried:
-    """Returns the best step with multiples of the dampings; see :func:`~.gauss_newton.step`.
-
-    Of the offsets tried at the same parameters, every segment keeps its best.
-    """
-    moves = [step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
-    points = torch.stack([point for point, _ in moves])
-    begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
-    squares = _squares(model, points, begun, scale)  # (a, b, S, C)
-    losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
-    least, chosen = losses.min(1)  # (a, S)
-    outcome = least.sum(-1) + points.square().sum(-1)
-    best = int(outcome.argmin())
-    place, every = chosen[best], torch.arange(len(offsets))
-    return _Tried(
-        points[best],
-        begun[best][place, every],
-        float(outcome[best]),
-        squares[best][place, every].sum(0),
-        damping * factors[best],
-        dampings * torch.tensor(factors, dtype=torch.float64)[place],
-    )
-
-
-def _objective(residual: Tensor, z: Tensor, offsets: Tensor) -> float:
-    """Returns what a fit minimises, of whitened residuals ``(S, N)``."""
-    return sum(float(part.square().sum()) for part in (residual, offsets, z))
 
 
 def _by_channel(residual: Tensor, scale: Tensor) -> Tensor:

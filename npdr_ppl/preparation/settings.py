@@ -83,9 +83,6 @@ class SegmentFitSettings:
         damping_limits: Smallest and greatest damping.
         near_factors: Multiples of the last successful damping that are tried first.
         far_factors: Multiples that are tried if the near ones gain less than seems possible.
-        good_share: A step with the least of the near dampings is taken without trying the others
-            if its gain is at least this share of that with linear residuals. A quarter is usual
-            (Moré 1983, Recent developments in algorithms and software for trust region methods).
         rough_gain: Rough steps end when no step can reduce the objective by more than this share.
         settled_scale: Rough steps end only when the last step has kept each channel's scale at
             this share of its previous value or more.
@@ -120,7 +117,6 @@ class SegmentFitSettings:
     damping_limits: tuple[float, float] = (1e-8, 1e6)
     near_factors: tuple[float, ...] = (0.1, 1.0, 10.0)
     far_factors: tuple[float, ...] = (1e-4, 1e-2, 1.0, 1e2, 1e4)
-    good_share: float = 0.25
     rough_gain: float = 1e-3
     settled_scale: float = 0.95
     longest_step: float = 1.0
@@ -145,7 +141,7 @@ class SegmentFitSettings:
         check_range(self, 0.0, math.inf, "restart_distances", "wide_restart_distances")
         check_range(self, 1.0, math.inf, "outlier_misfit")
         check_range(self, 0, 100, "restart_directions", "most_restarts", "most_updates")
-        check_range(self, 0.0, math.inf, "least_ratio", "good_share")
+        check_range(self, 0.0, math.inf, "least_ratio")
 
 
 @dataclass(frozen=True)

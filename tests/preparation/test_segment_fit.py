@@ -1,7 +1,6 @@
 """Steps of the fit of parameters and initial states."""
 
 import dataclasses
-import math
 
 import pyro
 import pyro.distributions as dist
@@ -291,27 +290,6 @@ def _coasts(rates):
         action_names=("torque",),
         time_step=0.02,
     )
-
-
-def test_one_step_is_tried_where_it_gains_enough(segments, monkeypatch):
-    sizes = []
-    simulate = segments.residuals
-
-    def counted(z, offsets, scale):
-        sizes.append(len(z))
-        return simulate(z, offsets, scale)
-
-    monkeypatch.setattr(segments, "residuals", counted)
-    found = fit_segments(segments, START)
-    sparing = sum(sizes)
-    sizes.clear()
-    monkeypatch.setattr(
-        segment_fit, "SEGMENT_FIT", dataclasses.replace(SEGMENT_FIT, good_share=math.inf)
-    )
-    thorough = fit_segments(segments, START)
-    assert sparing < 0.7 * sum(sizes)
-    ends = [objective(segments, f.z, f.offsets, thorough.scale) for f in (found, thorough)]
-    assert abs(ends[0] - ends[1]) < 2 * SEGMENT_FIT.least_gain
 
 
 def _at(segments, z):
