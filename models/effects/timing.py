@@ -58,7 +58,7 @@ class SensorDelay(SensorEffect):
         return {"delay": dist.Uniform(0.0, 0.03)}
 
     def history(self, parameters: Mapping[str, Tensor], time_step: float) -> int:
-        """Returns the number of steps that begin within the longest delay, and one."""
+        """Returns the number of past values that the longest delay needs, and one."""
         return math.floor(float(parameters["delay"].detach().max()) / time_step) + 2
 
     def lead(self, parameters: Mapping[str, Tensor], time: Tensor) -> Tensor:

@@ -7,6 +7,8 @@ import torch
 
 from npdr_ppl.engines.common.bends import Bends
 from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import ClockSkew, SensorDelay, SensorLowPass
 from npdr_ppl.models.pendulum import Pendulum
 
 H, TIME = 0.02, 0.7
@@ -39,7 +41,7 @@ def test_values_between_steps_are_far_closer_than_a_straight_line(column):
         assert abs(error) < 0.02 * abs(of_line)
 
 
-def test_velocities_ahead_of_the_positions_have_the_same_bend():
+def test_velocities_behind_the_positions_have_the_same_bend():
     # Semi-implicit Euler steps under a constant acceleration: x₁ = x₀ + h v₁.
     present, last = (
         tuple(torch.tensor([x], dtype=torch.float64) for x in pair)
@@ -73,3 +75,45 @@ def test_bends_before_a_start_are_those_of_a_constant_acceleration():
         assert float(bend) == pytest.approx(-0.5 * 2.0 * H * H)
     assert all(float(bend) == 0.0 for bend in bends.before(1, changes))
     assert len(bends.before(0, changes)) == 3
+
+
+def test_a_later_effect_filters_what_the_earlier_one_measured():
+    delay, low_pass = SensorDelay("angle,velocity"), SensorLowPass("angle,velocity")
+    free = {f"{delay.name}.delay": 0.025, f"{low_pass.name}.time_constant": 0.012}
+    given = {name: torch.tensor(value, dtype=torch.float64) for name, value in free.items()}
+    simulator = Pendulum(integrator="rk4").with_effects(delay, low_pass)
+
+    def measured(parts):
+        still = Inputs.single(
+            torch.zeros(60 * parts, 1, dtype=torch.float64),
+            torch.tensor([0.4, 0.0], dtype=torch.float64),
+            action_names=("torque",),
+            state_names=("angle", "velocity"),
+            time_step=H / parts,
+        )
+        return simulator.simulate(given, still)[..., parts - 1 :: parts, :]
+
+    error = measured(1) - measured(8)
+    # Of a motion of 0.4 rad and 2 rad/s.
+    assert error[..., 0].abs().max() < 2e-4
+    assert error[..., 1].abs().max() < 1e-2
+
+
+@pytest.mark.parametrize(
+    "effect", [ClockSkew("clock"), SensorLowPass("angle")], ids=lambda e: e.id
+)
+def test_a_position_whose_rate_is_no_channel_begins_without_a_bend(effect):
+    simulator = Pendulum(integrator="rk4")
+    simulator.sensors = (Channel("angle", "rad"),)
+    name, value = ("skew", 1e-3) if effect.id == "clock_skew" else ("time_constant", 0.012)
+    moving = Inputs.single(
+        torch.zeros(3, 1, dtype=torch.float64),
+        torch.tensor([0.0, 2.0], dtype=torch.float64),
+        action_names=("torque",),
+        state_names=("angle", "velocity"),
+        time_step=H,
+    )
+    given = {f"{effect.name}.{name}": torch.tensor(value, dtype=torch.float64)}
+    alone = simulator.with_effects(effect).simulate(given, moving)
+    both = Pendulum(integrator="rk4").with_effects(effect).simulate(given, moving)
+    torch.testing.assert_close(alone[..., 0], both[..., 0], rtol=0.0, atol=1e-4)

@@ -5,9 +5,10 @@ steps. A value goes from x₀ to x₁ along
 
     x(s) = (1 − s) x₀ + s x₁ + s (1 − s) b,  s from 0 to 1,
 
-with a bend b. A position's bend follows from its rates at both ends, as that of the cubic
-polynomial with these rates, whose other coefficient is of a higher order in the step. A rate's
-bend is that with which its integral is the position's change.
+with a bend b, which is four times the deviation from the straight line at the middle of the step;
+for a constant acceleration a, it is −½ a h². If the rate is a channel, too, a position's bend is
+½ h (v₀ − v₁). A rate's bend is chosen so that its integral over the step is the change of the
+position.
 """
 
 from collections.abc import Mapping
@@ -27,9 +28,8 @@ class Bends:
     Args:
         simulator: The system.
         time_step: Seconds per step.
-        rate_lag: How far velocities are ahead of the positions' derivative at the same time, as a
-            share of a step; see :class:`~npdr_ppl.engines.common.integrators.Integrator`.
-            ``None`` if it is unknown; velocities then move on straight lines.
+        rate_lag: By which share of a step velocities are behind the positions' derivative;
+            ``None`` if it is unknown. Velocities then move on straight lines.
     """
 
     def __init__(self, simulator: Simulator, time_step: float, rate_lag: float | None) -> None:
@@ -51,7 +51,8 @@ class Bends:
     ) -> Tensor:
         """Returns the bend of a channel in a step, ``(N,)``.
 
-        A position whose rate is no channel follows the parabola through three values.
+        If the rate of a position is no channel, the bend is that of :meth:`of_three`. If the
+        position of a rate is no channel, the bend is zero.
 
         Args:
             column: The channel.
@@ -64,12 +65,27 @@ class Bends:
             rate = self._positions[column]
             return 0.5 * h * (last[rate] - present[rate])
         if column not in self._rates:
-            return 0.5 * (last[column] - previous[column] - change)
+            return self.of_three(column, present[column], last[column], previous[column])
         position, lag = self._rates[column], self._rate_lag
         if position is None or lag is None:
             return torch.zeros_like(change)
         mean = last[column] + (0.5 + lag) * change
         return 6.0 * ((present[position] - last[position]) / h - mean)
+
+    def of_three(self, column: int, present: Tensor, last: Tensor, previous: Tensor) -> Tensor:
+        """Returns the bend of the parabola through three values of a channel; 0 for a rate.
+
+        Rates have kinks between steps.
+
+        Args:
+            column: The channel.
+            present: Value after the step, ``(N,)``.
+            last: Value before it.
+            previous: Value one step earlier; NaN if it is unknown, for which the bend is 0.
+        """
+        if column in self._rates:
+            return torch.zeros_like(present)
+        return (0.5 * (2.0 * last - previous - present)).nan_to_num(0.0)
 
     def before(self, column: int, changes: Mapping[int, tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Returns the bends of a channel in the steps before a start, latest first.
@@ -77,7 +93,8 @@ class Bends:
         Args:
             column: The channel.
             changes: Differences of earlier true values from those at the start, latest first, by
-                channel; they follow from constant accelerations.
+                channel. They were computed with a constant acceleration in each step, so that
+                rates have no bend there.
         """
         own = changes.get(column, ())
         if column in self._rates:

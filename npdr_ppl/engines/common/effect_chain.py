@@ -38,7 +38,7 @@ class EffectChain(ABC):
             :func:`needed_histories`.
         force_step: Seconds between two evaluations of the force effects; ``None`` for
             ``time_step``.
-        rate_lag: How far velocities are ahead of the positions' derivative, as a share of a step;
+        rate_lag: By which share of a step velocities are behind the positions' derivative;
             ``None`` if it is unknown.
 
     Attributes:

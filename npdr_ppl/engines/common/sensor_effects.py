@@ -1,8 +1,10 @@
 """The sensor effects of a simulator: what becomes of true values before they are measured."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from npdr_ppl.engines.common.bends import Bends
@@ -43,10 +45,21 @@ class SensorEffects:
                 channels = sensors if port.kind == "clock" else port.channels
                 columns = tuple(sensors.index(name) for name in channels)
                 self.effects.append((place, effect, columns))
+        self._is_later = self._later_bends()
         self._needs_bends = any(effect.needs_bend for _, effect, _ in self.effects)
         self._bends = Bends(simulator, time_step, rate_lag)
+        self._simulator = simulator
         self._histories = histories
         self._time_step = time_step
+
+    def _later_bends(self) -> list[tuple[bool, ...]]:
+        """Returns for each effect and channel whether an earlier effect changed its bend."""
+        changed: set[int] = set()
+        result = []
+        for _, effect, columns in self.effects:
+            result.append(tuple(effect.needs_bend and c in changed for c in columns))
+            changed |= set(columns) if effect.needs_bend else set()
+        return result
 
     @property
     def num_before(self) -> int:
@@ -78,16 +91,25 @@ class SensorEffects:
             bends = self._bends.before(column, changes)[:length] if effect.needs_bend else ()
             return Start(time, self._time_step, own, length, known, bends)
 
+        def memory(
+            place: int, effect: SensorEffect, length: int, column: int, is_later: bool
+        ) -> Any:
+            reading = true[column] if (reported := readings[column]) is None else reported
+            own = effect.initial_memory(
+                true[column], reading, start(place, effect, length, column)
+            )
+            if not is_later:
+                return own
+            unknown = torch.full_like(true[column], math.nan)
+            return own, unknown, unknown
+
+        effects = zip(self.effects, self._histories, self._is_later, strict=True)
         return tuple(
             tuple(
-                effect.initial_memory(
-                    true[c],
-                    true[c] if (reported := readings[c]) is None else reported,
-                    start(place, effect, length, c),
-                )
-                for c in columns
+                memory(place, effect, length, column, is_later)
+                for column, is_later in zip(columns, later, strict=True)
             )
-            for (place, effect, columns), length in zip(self.effects, self._histories, strict=True)
+            for (place, effect, columns), length, later in effects
         )
 
     def initial_past(
@@ -97,18 +119,26 @@ class SensorEffects:
 
         Args:
             true: True value of each sensor at the start, ``(N,)`` each.
-            changes: See :meth:`initial_memory`; without them, nothing moved.
+            changes: See :meth:`initial_memory`; earlier values are NaN where they are unknown.
         """
         if not self._needs_bends:
             return ()
+        states = {state.name for state in self._simulator.states}
         earlier = tuple(
-            value + changes[column][0] if changes.get(column) else value
-            for column, value in enumerate(true)
+            value + changes[column][0]
+            if changes.get(column) and sensor.name in states
+            else torch.full_like(value, math.nan)
+            for column, (sensor, value) in enumerate(
+                zip(self._simulator.sensors, true, strict=True)
+            )
         )
         return true, earlier
 
     def report(self, state: State, true: Components, tables: Tables) -> tuple[State, Components]:
         """Passes the true values of one step through the effects.
+
+        The bend of a true value is not that of a late or filtered one. A later effect therefore
+        gets the bend of its own last inputs.
 
         Args:
             state: State after the step.
@@ -121,13 +151,21 @@ class SensorEffects:
         if not self.effects:
             return state, true
         readings, memories = list(true), []
-        for (place, effect, columns), memory in zip(
-            self.effects, state.sensor_memory, strict=True
+        for (place, effect, columns), memory, later in zip(
+            self.effects, state.sensor_memory, self._is_later, strict=True
         ):
             changed = list(memory)
             for m, column in enumerate(columns):
                 own = tables.effects[place]
-                if effect.needs_bend:
+                if later[m]:
+                    kept, *inputs = memory[m]
+                    present = readings[column]
+                    bend = self._bends.of_three(column, present, *inputs)
+                    readings[column], kept = effect.read_bent(
+                        present, bend, own, kept, self._time_step
+                    )
+                    changed[m] = kept, present, inputs[0]
+                elif effect.needs_bend:
                     bend = self._bends.within(column, true, *state.past_readings)
                     readings[column], changed[m] = effect.read_bent(
                         readings[column], bend, own, memory[m], self._time_step

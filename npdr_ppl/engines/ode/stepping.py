@@ -19,6 +19,7 @@ from npdr_ppl.language.effect_context import Joint
 __all__ = ["Stepper"]
 
 _LEAST_ORDER_FOR_BENDS = 3
+"""Order from which on positions tell how velocities move within a step."""
 
 
 class Stepper(EffectChain):
@@ -35,7 +36,8 @@ class Stepper(EffectChain):
         self, simulator: MechanicalSystem, time_step: float, histories: tuple[int, ...]
     ) -> None:
         substep = time_step / simulator.substeps
-        # Positions of lower order do not tell how the velocity bends.
+        # Below third order, the error of a step's position is as large as what the velocity's bend
+        # adds to it, O(h³).
         rate_lag = 0.0 if simulator.integrator.order >= _LEAST_ORDER_FOR_BENDS else None
         super().__init__(
             simulator,

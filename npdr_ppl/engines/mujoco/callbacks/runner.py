@@ -1,6 +1,7 @@
 """Steps MuJoCo with laws, in the order in which npdr_ppl's own simulations apply them."""
 
 # pyright: reportAttributeAccessIssue=false
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,6 +53,11 @@ class LawRunner:
         self.partners = _partners(model, channels)
         self.last: dict[str, float] = {}
         self.previous: dict[str, float] = {}
+        bending = [law.channel if law.takes_bend else None for law in self.sensors]
+        self.later = {
+            k for k, name in enumerate(bending) if name is not None and name in bending[:k]
+        }
+        self.inputs: dict[int, tuple[float, float]] = {}
         self.needs_dynamics = any(law.needs_dynamics for law, *_ in self.forces)
         self.friction = model.dof_frictionloss
         low, high = model.actuator_ctrlrange.T
@@ -75,7 +81,8 @@ class LawRunner:
         for law, _ in self.servos:
             law.reset()
         values = self._true_values(data)
-        self.last, self.previous = dict(values), dict(values)
+        self.last, self.previous = dict(values), dict.fromkeys(values, math.nan)
+        self.inputs = dict.fromkeys(self.later, (math.nan, math.nan))
         step = self.substeps * float(self.model.opt.timestep)
         for law in self.sensors:
             values[law.channel] = law.reset(values[law.channel], step)
@@ -100,9 +107,15 @@ class LawRunner:
             self._substep(data)
         true = self._true_values(data)
         values = dict(true)
-        for law in self.sensors:
-            name = law.channel
-            bend = self._bend(name, true, step, count)
+        for k, law in enumerate(self.sensors):
+            name, bend = law.channel, 0.0
+            if k in self.inputs:
+                # The bend of a true value is not that of a late or filtered one.
+                last, previous = self.inputs[k]
+                self.inputs[k] = values[name], last
+                bend = self._bend_of_three(name, values[name], last, previous)
+            elif law.takes_bend and self.last:
+                bend = self._bend(name, true, step, count)
             values[name] = law.read(values[name], bend, float(data.time), step)
         self.last, self.previous = true, self.last
         return values
@@ -113,15 +126,22 @@ class LawRunner:
         change = true[name] - last[name]
         if name not in self.rates:
             if partner is None:
-                return 0.5 * (last[name] - self.previous[name] - change)
+                return self._bend_of_three(name, true[name], last[name], self.previous[name])
             return 0.5 * step * (last[partner] - true[partner])
         if partner is None:
             return 0.0
-        # All integrators but this one advance positions with the velocities at a step's end.
+        # RK4 advances positions with a mean velocity; all other integrators use the velocity at
+        # the end of an engine step.
         is_fourth = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         lag = 0.0 if is_fourth else 0.5 / count
         mean = last[name] + (0.5 + lag) * change
         return 6.0 * ((true[partner] - last[partner]) / step - mean)
+
+    def _bend_of_three(self, name: str, present: float, last: float, previous: float) -> float:
+        """Returns the bend of the parabola through three values; 0 if one of them is unknown."""
+        if name in self.rates or math.isnan(previous):
+            return 0.0
+        return 0.5 * (2.0 * last - previous - present)
 
     def _after_laws(self, commands: Any, step: float) -> tuple[Any, Any]:
         """Returns mean and moment of each command after the laws, for a step in seconds."""

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from npdr_ppl.engines.mujoco.callbacks.command_laws import lengthened, remaining
 
@@ -23,7 +24,10 @@ class SensorLaw:
 
     Attributes:
         channel: Name of the channel.
+        takes_bend: Whether it uses how the value moved within a step.
     """
+
+    takes_bend: ClassVar[bool] = False
 
     channel: str
 
@@ -86,6 +90,7 @@ class Quantisation(SensorLaw):
 class SensorLowPass(SensorLaw):
     """ẏ = (x − y)/T, exact for a value that follows its bend."""
 
+    takes_bend: ClassVar[bool] = True
     time_constant: float
     output: float = field(default=0.0, init=False, repr=False)
     last: float = field(default=0.0, init=False, repr=False)
@@ -109,6 +114,7 @@ class SensorLowPass(SensorLaw):
 class SensorDelay(SensorLaw):
     """x(t − d), along the bends of the steps."""
 
+    takes_bend: ClassVar[bool] = True
     delay: float
     past: deque[float] = field(default_factory=deque, init=False, repr=False)
     bends: deque[float] = field(default_factory=deque, init=False, repr=False)
@@ -136,6 +142,7 @@ class SensorDelay(SensorLaw):
 class ClockSkew(SensorLaw):
     """x(t (1 + κ)): measurements timed by a clock with another rate."""
 
+    takes_bend: ClassVar[bool] = True
     skew: float
     last: float = field(default=0.0, init=False, repr=False)
 
