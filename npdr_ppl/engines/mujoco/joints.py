@@ -68,7 +68,8 @@ def _inverse(matrices: Array) -> Array:
 
     Each row is swept once for all matrices (Goodnight 1979, A tutorial on the SWEEP operator),
     which takes a fraction of the time of one LAPACK call per small matrix. The matrix of a lost
-    simulation may be singular; its inverse is not finite, and the others do not change.
+    simulation may be singular. Its inverse is then infinite, NaN or huge, and the others do not
+    change.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for k in range(len(matrices)):

@@ -95,7 +95,7 @@ class SensorEffect(Effect):
         memory: Any,
         time_step: float,
     ) -> tuple[Tensor, Any]:
-        """Returns the measurement after a step whose motion is known, and the next memory.
+        """Returns the measurement after a step along a parabola, and the next memory.
 
         By default it is :meth:`read`, which takes the motion for a straight line.
 

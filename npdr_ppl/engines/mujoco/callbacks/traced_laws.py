@@ -283,7 +283,9 @@ def _servo(effect: ServoEffect) -> TracedLaw:
 
 def _sensor(effect: SensorEffect) -> TracedLaw:
     if effect.needs_past or effect.needs_bend or type(effect).history is not SensorEffect.history:
-        raise ModelError("it needs values between steps, or earlier ones")
+        raise ModelError(
+            "its measurement depends on the motion within a step, or on earlier values"
+        )
     recorder = Recorder()
     own = _parameters(effect, recorder)
     value, h = recorder.number("value"), recorder.number("step")
