@@ -161,6 +161,9 @@ class SensorEffects:
                     kept, *inputs = memory[m]
                     present = readings[column]
                     bend = self._bends.of_three(column, present, *inputs)
+                    # An earlier effect of no strength changes nothing.
+                    same = self._bends.within(column, true, *state.past_readings)
+                    bend = torch.where(present == true[column], same, bend)
                     readings[column], kept = effect.read_bent(
                         present, bend, own, kept, self._time_step
                     )

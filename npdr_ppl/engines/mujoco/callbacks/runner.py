@@ -109,13 +109,14 @@ class LawRunner:
         values = dict(true)
         for k, law in enumerate(self.sensors):
             name, bend = law.channel, 0.0
-            if k in self.inputs:
+            if k in self.inputs and values[name] != true[name]:
                 # The bend of a true value is not that of a late or filtered one.
                 last, previous = self.inputs[k]
-                self.inputs[k] = values[name], last
                 bend = self._bend_of_three(name, values[name], last, previous)
             elif law.takes_bend and self.last:
                 bend = self._bend(name, true, step, count)
+            if k in self.inputs:
+                self.inputs[k] = values[name], self.inputs[k][0]
             values[name] = law.read(values[name], bend, float(data.time), step)
         self.last, self.previous = true, self.last
         return values
