@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.language.effects import BentSensorEffect, SensorEffect
 from npdr_ppl.models.effects.equivalence import ANGLE_OFFSET, FIRST_ORDER_LAG, POSITION_SCALE
 from npdr_ppl.models.effects.lag import remaining
 from npdr_ppl.models.effects.references import LJUNG_1999, MUJOCO
@@ -18,10 +18,10 @@ from npdr_ppl.models.effects.references import LJUNG_1999, MUJOCO
 __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 
 
-class SensorLowPass(SensorEffect):
+class SensorLowPass(BentSensorEffect):
     """ẏ = (x − y)/T: a filtered measurement, e.g. a velocity derived from an encoder.
 
-    Exact for a value that follows its bend; see :meth:`SensorEffect.read_bent`. The measurement
+    Exact for a value that follows its bend; see :meth:`BentSensorEffect.read_bent`. The measurement
     therefore lags by T at any sampling rate, as that of a driver that filters the
     encoder's differences. At a segment's start the filter's output is the measurement there. If
     one driver filters several channels, attach it to the group, ``"arm_velocity,pole_velocity"``.
@@ -30,7 +30,6 @@ class SensorLowPass(SensorEffect):
     id = "sensor_low_pass"
     parameters = (Parameter("time_constant", "s", 0.0, "time constant T"),)
     per_recording = ("time_constant",)
-    needs_bend = True
     spans = ("joint", "rate", "rates", "all")
     law = "ẏ = (x − y)/T"
     equivalence = (FIRST_ORDER_LAG,)
@@ -54,12 +53,6 @@ class SensorLowPass(SensorEffect):
         of_bend = 2.0 * (steps - (steps + 0.5) * trailing)
         weights = 1.0 - trailing, trailing - decay, decay, of_bend
         return tuple(weight.expand(value.shape) for weight in weights), (reading, value)
-
-    def read(
-        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
-    ) -> tuple[Tensor, Any]:
-        """Returns the filter's output, and the memory with the true value."""
-        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
 
     def read_bent(
         self,

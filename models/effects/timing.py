@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.language.effects import BentSensorEffect
 from npdr_ppl.models.effects.equivalence import LATENCY
 from npdr_ppl.models.effects.references import LJUNG_1999
 
@@ -30,10 +30,10 @@ def _of_bend(age: Tensor) -> Tensor:
     return (age * (1.0 - age)).clamp_min(0.0)
 
 
-class SensorDelay(SensorEffect):
+class SensorDelay(BentSensorEffect):
     """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
 
-    Between steps a value follows its bend; see :meth:`SensorEffect.read_bent`. Attach it to all
+    Between steps a value follows its bend; see :meth:`BentSensorEffect.read_bent`. Attach it to all
     channels that share the delay.
 
     The measurement at a segment's start is the state d earlier. The segment's initial state is
@@ -46,7 +46,6 @@ class SensorDelay(SensorEffect):
     parameters = (Parameter("delay", "s", 0.0, "delay d"),)
     is_smooth = False
     needs_past = True
-    needs_bend = True
     spans = ("joint", "rates", "all")
     law = "y(t − d)"
     equivalence = (LATENCY,)
@@ -73,12 +72,6 @@ class SensorDelay(SensorEffect):
         bends = (*start.bends, *(torch.zeros_like(value) for _ in range(num)))
         return weights, of_bends, (value, *start.past(value)[:-1]), bends[: num - 1]
 
-    def read(
-        self, value: Tensor, parameters: Mapping[str, Tensor], memory: _Past, time_step: float
-    ) -> tuple[Tensor, _Past]:
-        """Returns the value a time d earlier."""
-        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
-
     def read_bent(
         self,
         value: Tensor,
@@ -96,18 +89,17 @@ class SensorDelay(SensorEffect):
         return reading, (weights, of_bends, past[:-1], bends[:-1])
 
 
-class ClockSkew(SensorEffect):
+class ClockSkew(BentSensorEffect):
     """y(t) = x(t (1 + κ)): measurements timed by a clock with another rate than the commands'.
 
     κ t is small. A value therefore follows from that of the last step and from its bend; see
-    :meth:`SensorEffect.read_bent`. Both clocks agree when a rollout begins; measurements at a
+    :meth:`BentSensorEffect.read_bent`. Both clocks agree when a rollout begins; measurements at a
     segment's start are κ t ahead.
     """
 
     id = "clock_skew"
     port_kinds = ("clock",)
     parameters = (Parameter("skew", "1", 0.0, "relative skew κ"),)
-    needs_bend = True
     law = "t (1 + κ)"
     excitation = "long_run"
     reference = LJUNG_1999
@@ -131,16 +123,6 @@ class ClockSkew(SensorEffect):
     ) -> tuple[Tensor, Tensor]:
         """Returns the time and the present value."""
         return start.time, value
-
-    def read(
-        self,
-        value: Tensor,
-        parameters: Mapping[str, Tensor],
-        memory: tuple[Tensor, Tensor],
-        time_step: float,
-    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """Returns the value κ t ahead."""
-        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
 
     def read_bent(
         self,

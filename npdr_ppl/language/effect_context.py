@@ -61,7 +61,7 @@ class Start(NamedTuple):
             steps before and so on, as the simulator without its effects predicts. Empty for
             effects that are not on sensors or do not request it.
         bends: Bends of the true value in the last step before the start, the one before and so
-            on; see :meth:`SensorEffect.read_bent`. Empty for effects that do not request them.
+            on; see :meth:`BentSensorEffect.read_bent`. Empty for effects that do not request them.
         displacements: How far a joint moved in each interval before the start, oldest first, as
             recorded. Empty for effects that are not on joints or do not request it, and where no
             recording tells: in an episode, or if the joint's position was not measured.

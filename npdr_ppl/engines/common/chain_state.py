@@ -23,8 +23,8 @@ class State(NamedTuple):
         action_memory: Own state of each action effect.
         past_commands: Past commands that each action effect may need, latest first.
         sensor_memory: Own state of each sensor effect for each of its channels.
-        past_readings: True sensor values at the state's time and one step earlier; empty if no
-            effect has ``needs_bend``.
+        past_readings: True sensor values at the state's time and one step earlier; empty without
+            a :class:`~npdr_ppl.language.effects.BentSensorEffect`.
         servo_memory: Own state of each effect inside a servo.
     """
 

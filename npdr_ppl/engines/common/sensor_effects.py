@@ -11,7 +11,7 @@ from npdr_ppl.engines.common.bends import Bends
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.language.effect_context import Start
-from npdr_ppl.language.effects import SensorEffect
+from npdr_ppl.language.effects import BentSensorEffect, SensorEffect
 from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["SensorEffects"]
@@ -46,7 +46,9 @@ class SensorEffects:
                 columns = tuple(sensors.index(name) for name in channels)
                 self.effects.append((place, effect, columns))
         self._is_later = self._later_bends()
-        self._needs_bends = any(effect.needs_bend for _, effect, _ in self.effects)
+        self._needs_bends = any(
+            isinstance(effect, BentSensorEffect) for _, effect, _ in self.effects
+        )
         self._bends = Bends(simulator, time_step, rate_lag)
         self._simulator = simulator
         self._histories = histories
@@ -57,8 +59,10 @@ class SensorEffects:
         changed: set[int] = set()
         result = []
         for _, effect, columns in self.effects:
-            result.append(tuple(effect.needs_bend and c in changed for c in columns))
-            changed |= set(columns) if effect.needs_bend else set()
+            result.append(
+                tuple(isinstance(effect, BentSensorEffect) and c in changed for c in columns)
+            )
+            changed |= set(columns) if isinstance(effect, BentSensorEffect) else set()
         return result
 
     @property
@@ -88,7 +92,11 @@ class SensorEffects:
 
         def start(place: int, effect: SensorEffect, length: int, column: int) -> Start:
             own, known = tables.effects[place], changes.get(column, ())[:length]
-            bends = self._bends.before(column, changes)[:length] if effect.needs_bend else ()
+            bends = (
+                self._bends.before(column, changes)[:length]
+                if isinstance(effect, BentSensorEffect)
+                else ()
+            )
             return Start(time, self._time_step, own, length, known, bends)
 
         def memory(
@@ -157,7 +165,7 @@ class SensorEffects:
             changed = list(memory)
             for m, column in enumerate(columns):
                 own = tables.effects[place]
-                if later[m]:
+                if later[m] and isinstance(effect, BentSensorEffect):
                     kept, *inputs = memory[m]
                     present = readings[column]
                     bend = self._bends.of_three(column, present, *inputs)
@@ -168,7 +176,7 @@ class SensorEffects:
                         present, bend, own, kept, self._time_step
                     )
                     changed[m] = kept, present, inputs[0]
-                elif effect.needs_bend:
+                elif isinstance(effect, BentSensorEffect):
                     bend = self._bends.within(column, true, *state.past_readings)
                     readings[column], changed[m] = effect.read_bent(
                         readings[column], bend, own, memory[m], self._time_step

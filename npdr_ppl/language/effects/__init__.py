@@ -12,11 +12,12 @@ from npdr_ppl.language.effects.action import ActionEffect, Commands, Uneven
 from npdr_ppl.language.effects.effect import Effect, upper_end
 from npdr_ppl.language.effects.environment import EnvironmentEffect, ParameterEffect
 from npdr_ppl.language.effects.force import ForceEffect, LinearForceEffect
-from npdr_ppl.language.effects.sensor import SensorEffect
+from npdr_ppl.language.effects.sensor import BentSensorEffect, SensorEffect
 from npdr_ppl.language.effects.servo import ServoEffect
 
 __all__ = [
     "ActionEffect",
+    "BentSensorEffect",
     "Commands",
     "Effect",
     "EnvironmentEffect",

@@ -4,13 +4,14 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
 from npdr_ppl.language.channels import PortKind
 from npdr_ppl.language.effect_context import SensorSpan, Start
 from npdr_ppl.language.effects.effect import Effect
 
-__all__ = ["SensorEffect"]
+__all__ = ["BentSensorEffect", "SensorEffect"]
 
 
 class SensorEffect(Effect):
@@ -18,13 +19,11 @@ class SensorEffect(Effect):
 
     Attributes:
         needs_past: Whether its initial memory needs :attr:`Start.changes`.
-        needs_bend: Whether :meth:`read_bent` is called in place of :meth:`read`.
         spans: The channels that one device can affect with the same parameters.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("sensor",)
     needs_past: ClassVar[bool] = False
-    needs_bend: ClassVar[bool] = False
     spans: ClassVar[tuple[SensorSpan, ...]] = ("position", "rate", "positions", "rates")
 
     @property
@@ -87,6 +86,17 @@ class SensorEffect(Effect):
     ) -> tuple[Tensor, Any]:
         """Returns the measurement after a step, and the next memory."""
 
+
+class BentSensorEffect(SensorEffect):
+    """A sensor effect that depends on how the true value moves within a step."""
+
+    def read(
+        self, value: Tensor, parameters: Mapping[str, Tensor], memory: Any, time_step: float
+    ) -> tuple[Tensor, Any]:
+        """Returns the same for a value that moved along a straight line."""
+        return self.read_bent(value, torch.zeros_like(value), parameters, memory, time_step)
+
+    @abstractmethod
     def read_bent(
         self,
         value: Tensor,
@@ -97,8 +107,6 @@ class SensorEffect(Effect):
     ) -> tuple[Tensor, Any]:
         """Returns the measurement after a step along a parabola, and the next memory.
 
-        By default it is :meth:`read`, which takes the motion for a straight line.
-
         Args:
             value: True value after the step.
             bend: b, with which the true value went from x₀ to x₁ along
@@ -107,4 +115,3 @@ class SensorEffect(Effect):
             memory: The effect's own state.
             time_step: Seconds per step.
         """
-        return self.read(value, parameters, memory, time_step)

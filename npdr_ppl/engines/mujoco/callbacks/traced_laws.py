@@ -20,6 +20,7 @@ from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects import (
     ActionEffect,
+    BentSensorEffect,
     Commands,
     Effect,
     ForceEffect,
@@ -282,7 +283,11 @@ def _servo(effect: ServoEffect) -> TracedLaw:
 
 
 def _sensor(effect: SensorEffect) -> TracedLaw:
-    if effect.needs_past or effect.needs_bend or type(effect).history is not SensorEffect.history:
+    if (
+        effect.needs_past
+        or isinstance(effect, BentSensorEffect)
+        or type(effect).history is not SensorEffect.history
+    ):
         raise ModelError(
             "its measurement depends on the motion within a step, or on earlier values"
         )
