@@ -21,8 +21,8 @@ __all__ = ["EncoderBias", "EncoderScale", "Quantisation", "SensorLowPass"]
 class SensorLowPass(BentSensorEffect):
     """ẏ = (x − y)/T: a filtered measurement, e.g. a velocity derived from an encoder.
 
-    Exact for a value that follows its bend; see :meth:`BentSensorEffect.read_bent`. The measurement
-    therefore lags by T at any sampling rate, as that of a driver that filters the
+    Exact for a value that follows its bend; see :meth:`BentSensorEffect.read_bent`. The
+    measurement therefore lags by T at any sampling rate, as that of a driver that filters the
     encoder's differences. At a segment's start the filter's output is the measurement there. If
     one driver filters several channels, attach it to the group, ``"arm_velocity,pole_velocity"``.
     """

@@ -33,8 +33,8 @@ def _of_bend(age: Tensor) -> Tensor:
 class SensorDelay(BentSensorEffect):
     """y(t) = x(t − d) with a delay d that need not be a whole number of steps.
 
-    Between steps a value follows its bend; see :meth:`BentSensorEffect.read_bent`. Attach it to all
-    channels that share the delay.
+    Between steps a value follows its bend; see :meth:`BentSensorEffect.read_bent`. Attach it to
+    all channels that share the delay.
 
     The measurement at a segment's start is the state d earlier. The segment's initial state is
     computed from it by the simulator without its effects, under the commands of that time. The
