@@ -177,6 +177,7 @@ class PartRecord(TypedDict):
     is_found: bool
     probability: Number
     instead: str
+    contradicts: NotRequired[bool]
 
 
 class EffectRecord(TypedDict):
@@ -193,6 +194,7 @@ class EffectRecord(TypedDict):
     parts: NotRequired[list[EffectPart]]
     in_halves: NotRequired[dict[str, bool]]
     found_in: NotRequired[list[PartRecord]]
+    doubt: NotRequired[str]
 
 
 class GapRecord(TypedDict, total=False):

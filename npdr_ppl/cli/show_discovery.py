@@ -43,7 +43,6 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     # Not at the top: other commands show their results without them.
     from npdr_ppl.discovery.proof.estimated_anew import ANEW
-    from npdr_ppl.discovery.search.parts import missing_where
 
     if found["effects"]:
         table = Table(title="Missing effects", box=SIMPLE, padding=(0, 1, 0, 0))
@@ -78,10 +77,9 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         if uncompared:
             console.print(f"Not compared with alternatives: {escape(', '.join(uncompared))}.")
         for effect in found["effects"]:
-            parts = {part["part"]: part["is_found"] for part in effect.get("found_in") or []}
-            if not all(parts.values()):
-                name, where = f"{effect['port']}.{effect['effect']}", missing_where(parts)
-                console.print(f"{escape(name)} was not found in {where}.")
+            if doubt := effect.get("doubt"):
+                name = f"{effect['port']}.{effect['effect']}"
+                console.print(escape(f"{name} {doubt}."))
     if found.get("learned"):
         _show_learned(console, found["learned"])
     if found["gap"]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from npdr_ppl.discovery.proof.parameter_intervals import Estimate
-from npdr_ppl.discovery.search.parts import PartResult
+from npdr_ppl.discovery.search.parts import PartResult, doubt_of
 from npdr_ppl.discovery.search.repeatability import HALVES, Repetition
 from npdr_ppl.language.effects import Effect
 
@@ -53,8 +53,13 @@ class Finding:
 
     @property
     def can_be_named(self) -> bool:
-        """Whether it is large enough, and every part in which it was sought shows it."""
-        return not self.is_minor and all(part.is_found for part in self.found_in)
+        """Whether it is large enough, and is found again in parts of the recording."""
+        return not self.is_minor and not self.doubt
+
+    @property
+    def doubt(self) -> str:
+        """Why it is not found again in parts of the recording; see :func:`doubt_of`."""
+        return doubt_of(self.found_in)
 
     @property
     def in_halves(self) -> dict[str, bool]:
@@ -78,4 +83,5 @@ class Finding:
             "parts": [] if self.repetition is None else self.repetition.to_list(),
             "in_halves": self.in_halves,
             "found_in": [part.to_dict() for part in self.found_in],
+            "doubt": self.doubt,
         }

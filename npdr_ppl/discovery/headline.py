@@ -22,10 +22,7 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
     word = str(result.get("verdict", "no verdict"))
     effects = result.get("effects") or []
     large = [
-        effect
-        for effect in effects
-        if not effect.get("is_minor")
-        and all(part["is_found"] for part in effect.get("found_in") or [])
+        effect for effect in effects if not effect.get("is_minor") and not effect.get("doubt")
     ] or effects
     labels = [effect_label(effect) for effect in large]
     p_value = number((result.get("alarm") or {}).get("p_value"))

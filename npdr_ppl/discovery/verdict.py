@@ -6,7 +6,6 @@ from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.discovery_result import Verdict
 from npdr_ppl.discovery.finding import Finding
 from npdr_ppl.discovery.proof.held_out_gap import Gap
-from npdr_ppl.discovery.search.parts import missing_where
 from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE, TRIALS
 from npdr_ppl.discovery.settings import VERDICT
@@ -62,9 +61,9 @@ def judge(
             f"{once[0][0].effect.name} explains the misfit only with different values for {one} "
             f"and {other}, so it is not the cause."
         )
-    lost = [f for f in effects if not all(part.is_found for part in f.found_in)]
-    if sum(f.share for f in lost) > VERDICT.minor_share * explains:
-        return "unknown", _not_found(lost[0])
+    doubtful = [f for f in effects if f.doubt]
+    if sum(f.share for f in doubtful) > VERDICT.minor_share * explains:
+        return "unknown", f"{doubtful[0].effect.name} {doubtful[0].doubt}."
     unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
     sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
     if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
@@ -74,19 +73,11 @@ def judge(
     if not unsure:
         names = ", ".join(f.effect.name for f in effects)
         return "unknown", f"The effects that were found are too small to be named: {names}."
-    doubtful = most_doubtful(effects, options)
+    unclear = most_doubtful(effects, options)
     names = " or ".join(
-        n for n, p in doubtful.alternatives.items() if p >= EVIDENCE.least_probability
+        n for n, p in unclear.alternatives.items() if p >= EVIDENCE.least_probability
     )
     return "ambiguous", f"The recording cannot tell which effect is missing: {names}."
-
-
-def _not_found(effect: Finding) -> str:
-    """Returns the reason not to name an effect that a part of the recording does not show."""
-    where = missing_where({part.part: part.is_found for part in effect.found_in})
-    reason = f"{effect.effect.name} was not found in {where}."
-    better = next((part for part in effect.found_in if part.instead), None)
-    return f"{reason} {better.instead} explains {better.part} better." if better else reason
 
 
 def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Finding:

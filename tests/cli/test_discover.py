@@ -301,7 +301,7 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
         "effects": [
             {"effect": effect, "port": "hinge", "probability": 0.99, "is_minor": is_minor,
              "parameters": {"size": strength},
-             "found_in": [{"part": "the first half", "is_found": not is_minor}]}
+             "doubt": "is contradicted by the first half" if is_minor else ""}
             for effect, is_minor in (("bias", False), ("wind", True))
         ],
         "remainder": {"fired": False, "unexplained": 0.0}, "counts": {}, "next_experiment": None,
@@ -309,8 +309,8 @@ def test_effects_that_are_too_small_are_printed_apart(monkeypatch, tmp_path):
     show_discovery.show_discovery(found, tmp_path)
     shown = " ".join(text.getvalue().split())
     assert "Too small to be named, but in the model: hinge.wind." in shown
-    assert "hinge.wind was not found in the first half of the recording." in shown
-    assert "hinge.bias was not found" not in shown
+    assert "hinge.wind is contradicted by the first half." in shown
+    assert "hinge.bias is contradicted" not in shown
     assert "Not compared with alternatives" not in shown
     found["effects"][0]["probability"] = None  # a time limit ended the search
     # JSON has no infinite mean.

@@ -123,7 +123,7 @@ def test_small_effects_and_parts_of_the_recording_are_shown(runs, tmp_path):
     assert "the second half" in text and "0.39 ± 0.02" in text
 
 
-def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
+def test_an_effect_that_a_half_contradicts_is_no_headline(runs, tmp_path):
     folder = shutil.copytree(runs["discover"], tmp_path / "run")
     content = json.loads((folder / "discovery.json").read_text())
     content["effects"][0]["found_in"] = [
@@ -133,8 +133,16 @@ def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
             "is_found": False,
             "probability": 0.9,
             "instead": "hinge.bias",
+            "contradicts": True,
+        },
+        {
+            "part": "the recording without rollout 0",
+            "is_found": False,
+            "probability": 0.4,
+            "instead": "",
         },
     ]
+    content["effects"][0]["doubt"] = "is contradicted by the second half of the recording"
     bias = {"effect": "bias", "port": "hinge", "probability": 1.0, "share": 0.9}
     content["effects"].append(bias)
     (folder / "discovery.json").write_text(json.dumps(content))
@@ -142,6 +150,7 @@ def test_an_effect_that_a_half_does_not_show_is_no_headline(runs, tmp_path):
     assert "Missing: constant force at hinge" in text
     assert "Does a part of the recording alone show the effect?" in text
     assert "explained better by" in text and "constant force at hinge</td>" in text
+    assert "no, contradicts it" in text and "no, too weak to show it" in text
 
 
 def test_a_learned_law_is_the_headline_and_is_shown_where_it_was_checked(tmp_path):

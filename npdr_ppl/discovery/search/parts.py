@@ -15,10 +15,15 @@ models' evidence is compared along the part. One step can be wrong where the mot
 sticks: it then gains less than the ½ δᵀ (ρ Σ_P Jᵀ C⁻¹ r − z) that it should. If the result could
 be another one with what the other models' steps failed to gain, fits of the part decide; also if
 the result is not certain, and before every "not found".
+
+A part in which the robot hardly moves may be too weak to show an effect: a spring that hardens
+needs large angles. It contradicts the effect only if the evidence for it is smaller by a factor α
+in the whole recording than in the rest alone. With the true law this factor of a part, given the
+rest, is below α with a probability of at most α, however much or little the part can show.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -35,7 +40,7 @@ from npdr_ppl.discovery.search.settings import EVIDENCE, REPEATABILITY, TRIALS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.progress import Step
 
-__all__ = ["PartResult", "found_in_parts", "missing_where"]
+__all__ = ["PartResult", "doubt_of", "found_in_parts"]
 
 
 @dataclass(frozen=True)
@@ -48,12 +53,16 @@ class PartResult:
             form of the same law, and no other law explains the part clearly better.
         probability: Probability of the effect against the model without it, in this part.
         instead: Name of a law that explains the part clearly better; empty if there is none.
+        contradicts: Whether another law explains the part clearly better, or the part, together
+            with the rest of the recording, lowers the evidence for the effect. A part that neither
+            shows nor contradicts an effect is too weak to show it.
     """
 
     part: str
     is_found: bool
     probability: float
     instead: str = ""
+    contradicts: bool = False
 
     def to_dict(self) -> dict[str, object]:
         """Returns JSON-serialisable values."""
@@ -92,20 +101,32 @@ def found_in_parts(
                 result[name].append(found)
                 if not found.is_found:
                     because = f": {found.instead} explains it better" if found.instead else ""
-                    report(f"{part} does not show {name}{because}")
+                    does = "contradicts" if found.contradicts else "is too weak to show"
+                    report(f"{part} {does} {name}{because}")
     progress(1.0, f"{num} of {num} effects sought in parts of the recording")
     return result
 
 
-def missing_where(in_parts: Mapping[str, bool]) -> str:
-    """Returns where an effect was not found: a part's name, or that of both halves together.
+def doubt_of(found_in: Sequence[PartResult]) -> str:
+    """Returns why an effect is not found again, to follow its name in a sentence.
+
+    It is found again if no part contradicts it and at least one half alone shows it.
 
     Args:
-        in_parts: Whether it was found in each part, by the part's name.
+        found_in: The effect's results; none if it was not sought in parts.
+
+    Returns:
+        An empty string if there is no doubt.
     """
-    missed = [name for name, is_in in in_parts.items() if not is_in]
-    where = "either half" if set(HALVES) <= set(missed) else missed[0]
-    return f"{where} of the recording" if where in (*HALVES, "either half") else where
+    for each in found_in:
+        if each.contradicts:
+            where = f"{each.part} of the recording" if each.part in HALVES else each.part
+            better = f", which {each.instead} explains better" if each.instead else ""
+            return f"is contradicted by {where}{better}"
+    in_halves = [each.is_found for each in found_in if each.part in HALVES]
+    if in_halves and not any(in_halves):
+        return "was not found in either half of the recording alone"
+    return ""
 
 
 def _parts(hypothesis: Hypothesis) -> Iterator[tuple[str, Tensor]]:
@@ -152,7 +173,27 @@ class _Compared:
         if least.is_found and least.probability >= REPEATABILITY.certain_probability:
             return self._judged(part, models)
         asked = (own, "", least.instead) if least.instead else (own, "")
-        return self._judged(part, {name: _refitted(models[name]) for name in asked})
+        result = self._judged(part, {name: _refitted(models[name]) for name in asked})
+        if result.is_found or result.instead:
+            return result
+        return replace(result, contradicts=self._is_less_likely_with(index))
+
+    def _is_less_likely_with(self, index: Tensor) -> bool:
+        """Returns whether a part lowers the evidence for the effect that the rest gives.
+
+        The prior is the posterior of the rest, so a part that shows nothing changes nothing.
+
+        Args:
+            index: The part's segments.
+        """
+        assert self._without is not None
+        own, rest = self._trials[self._effect.name], _others(index, self._without)
+        steps = self._closest(rest)
+        if not {self._effect.name, ""} <= steps.keys():
+            return False
+        without, with_it = (_refitted(steps[name][0]) for name in ("", self._effect.name))
+        gain = _gain(self._without, own, own) - _gain(without, with_it, own)
+        return gain < math.log(EVIDENCE.least_probability)
 
     def _closest(self, index: Tensor) -> dict[str, tuple[Hypothesis, float]]:
         """Returns the models with the least loss along a part, see :meth:`_Step.along`."""
@@ -190,7 +231,8 @@ class _Compared:
         likeliest = max(weights, key=lambda name: weights[name])
         is_likely = weights[own] >= EVIDENCE.least_probability or self._is_same(likeliest, models)
         is_found = against_none >= REPEATABILITY.least_probability and is_likely
-        return PartResult(part, is_found, against_none, "" if is_likely else likeliest)
+        instead = "" if is_likely else likeliest
+        return PartResult(part, is_found, against_none, instead, contradicts=bool(instead))
 
     def _is_same(self, name: str, models: Mapping[str, Hypothesis]) -> bool:
         """Returns whether a law is another form of the effect."""
@@ -198,6 +240,29 @@ class _Compared:
             return True
         law = next(effect for effect in models[name].effects if effect.name == name)
         return overlap(law, self._effect)
+
+
+def _others(index: Tensor, hypothesis: Hypothesis) -> Tensor:
+    """Returns the indices of all other segments of a hypothesis."""
+    is_other = torch.ones(hypothesis.segments.inputs.num_segments, dtype=torch.bool)
+    is_other[index] = False
+    return is_other.nonzero()[:, 0]
+
+
+def _gain(without: Hypothesis, own: Hypothesis, reference: Hypothesis) -> float:
+    """Returns by how much an effect raises the log density at the fit, the prior included.
+
+    Args:
+        without: The fitted model without it.
+        own: The fitted model with it.
+        reference: The model whose residuals give the scale and the share.
+    """
+    scale, share = reference.fit.scale, reference.share
+    before, after = (
+        share * float(model.losses(scale).sum()) + 0.5 * float(model.fit.z.square().sum())
+        for model in (without, own)
+    )
+    return before - after
 
 
 def _refitted(part: Hypothesis) -> Hypothesis:

@@ -119,7 +119,7 @@ def _found_in(effects: Rows) -> list[Part]:
         [
             _named(effect),
             str(part.get("part")),
-            "yes" if part.get("is_found") else "no",
+            _shown_in(part),
             number(part.get("probability"), ".0%"),
             in_words(str(part.get("instead") or "")) or "–",
         ]
@@ -132,6 +132,13 @@ def _found_in(effects: Rows) -> list[Part]:
         "effect against the model without it, in this part."
     )
     return [TablePart(columns, rows, caption)] if rows else []
+
+
+def _shown_in(part: Mapping[str, Any]) -> str:
+    """Returns what a part of the recording says about an effect."""
+    if part.get("is_found"):
+        return "yes"
+    return "no, contradicts it" if part.get("contradicts") else "no, too weak to show it"
 
 
 def _alternatives(effects: Rows) -> list[Part]:

@@ -2,13 +2,14 @@
 
 import math
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from npdr_ppl.engines.common.chain_state import Moments, State, Tables, add_to
-from npdr_ppl.engines.common.commands import RecentCommands
+from npdr_ppl.engines.common.chain_state import Moments, State, Tables
+from npdr_ppl.engines.common.commands import CommandRecord, RecentCommands
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import ActionEffect, Commands, Uneven
@@ -33,6 +34,7 @@ class ActionEffects:
     Attributes:
         effects: Index in ``Tables.effects``, effect and action channel of each effect at each of
             its channels.
+        channels: Indices of the action channels that have effects.
     """
 
     def __init__(self, simulator: Simulator, histories: tuple[int, ...], time_step: float) -> None:
@@ -43,6 +45,7 @@ class ActionEffects:
             if isinstance(effect, ActionEffect)
             for name in effect.channels
         ]
+        self.channels = sorted({channel for _, _, channel in self.effects})
         self._histories = histories[: len(self.effects)]
         self._time_step = time_step
 
@@ -102,7 +105,8 @@ class ActionEffects:
             commands: One per action channel, already within the channel's limits: a device limits
                 commands at its input, and recordings contain limited commands.
             tables: Constants of the simulation.
-            records: Views of the recorded commands of each channel, if the whole past is recorded.
+            records: Views of the recorded commands of each channel, if the whole past is recorded;
+                those of channels without effects are not used.
 
         Returns:
             The state with the effects' memory advanced, the actions after all effects, and their
@@ -110,16 +114,60 @@ class ActionEffects:
         """
         if not self.effects:
             return state, commands, ()
-        present = list(commands)
-        moments: list[Tensor | None] = [None] * len(commands)
+        views = {} if records is None else dict(enumerate(records))
+        state, reached, moments = self._passed(state, dict(enumerate(commands)), tables, views)
+        return state, tuple(reached.values()), tuple(moments.get(k) for k in reached)
+
+    def act_on_record(
+        self,
+        state: State,
+        records: Sequence[CommandRecord],
+        step: int,
+        tables: Tables,
+    ) -> tuple[State, dict[int, Tensor], dict[int, Tensor]]:
+        """Passes recorded commands of one step through the effects, where there are effects.
+
+        Of an arm with many joints, most commands have none. To read them all for thousands of past
+        steps would take most of the time of a simulation.
+
+        Args:
+            state: State at the step's start.
+            records: Commands of each action channel.
+            step: The step; those before 0 are past.
+            tables: Constants of the simulation.
+
+        Returns:
+            The state with the effects' memory advanced; by channel with effects, the action after
+            them; and its moment where it has one, see :meth:`EffectChain.move`.
+        """
+        views = {channel: records[channel].view(step) for channel in self.channels}
+        commands = {channel: view.now() for channel, view in views.items()}
+        return self._passed(state, commands, tables, views)
+
+    def _passed(
+        self,
+        state: State,
+        commands: dict[int, Tensor],
+        tables: Tables,
+        views: Mapping[int, Commands],
+    ) -> tuple[State, dict[int, Tensor], dict[int, Tensor]]:
+        """Passes commands through the effects; see :meth:`act_on_record`.
+
+        Args:
+            state: State at the step's start.
+            commands: Commands by channel.
+            tables: Constants of the simulation.
+            views: Views of the recorded commands by channel; empty if they are not recorded.
+        """
+        present, moments = dict(commands), dict[int, Tensor]()
         memory, past = list(state.action_memory), list(state.past_commands)
-        is_raw = [True] * len(present)
+        is_raw = dict.fromkeys(present, True)
         for k, (place, effect, channel) in enumerate(self.effects):
             # The first effect of a chain can use the record. Later effects receive the output of
             # the effect before them and keep a history of it.
             command = present[channel]
-            if records is not None and is_raw[channel]:
-                seen = records[channel]
+            if views and is_raw[channel]:
+                seen = views[channel]
             else:
                 seen = RecentCommands(command, past[k])
             reached, memory[k] = effect.act(
@@ -127,13 +175,14 @@ class ActionEffects:
             )
             if isinstance(reached, Uneven):
                 reached, moment = reached
-                add_to(moments, channel, moment)
+                known = moments.get(channel)
+                moments[channel] = moment if known is None else known + moment
             present[channel] = reached
             if self._histories[k]:
                 past[k] = (command, *past[k][:-1])
             is_raw[channel] = False
         changed = state._replace(action_memory=tuple(memory), past_commands=tuple(past))
-        return changed, tuple(present), tuple(moments)
+        return changed, present, moments
 
     def by_substep(
         self, actions: Components, moments: Moments, substeps: int

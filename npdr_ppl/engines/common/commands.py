@@ -25,6 +25,12 @@ class CommandRecord:
     Commands before a rollout are zero, but a servo already holds the first goal. Commands before
     the oldest one that is included of a running rollout are assumed equal to it.
 
+    Attributes:
+        table: Commands in time-major order, flat.
+        stride: Entries of the table per time step.
+        rows: Entry of each simulation within a time step, ``(N,)``.
+        first: Time index of step 0.
+
     Args:
         inputs: The segments; their actions may carry batch dimensions.
         column: Column of the channel in the inputs' actions.
@@ -59,21 +65,12 @@ class CommandRecord:
             before = known[..., 0]
         # Time is the first axis, so that the commands of one step are contiguous in memory.
         self._table = torch.cat((before[..., None], known), dim=-1).movedim(-1, 0).contiguous()
+        self.table, self.stride = self._table.reshape(-1), self._table[0].numel()
         self._batch_shape: torch.Size | None = batch_shape
         segments = self._table.shape[1:]
         row = torch.arange(segments.numel(), device=known.device).reshape(segments)
         self.rows = row.expand(batch_shape).reshape(-1)
         self.first = 1 + num_past
-
-    @property
-    def table(self) -> Tensor:
-        """Commands in time-major order, flat."""
-        return self._table.reshape(-1)
-
-    @property
-    def stride(self) -> int:
-        """Entries of the table per time step."""
-        return self._table[0].numel()
 
     def at(self, step: int) -> Tensor:
         """Returns the command of each simulation at a step, ``(N,)``; steps before 0 are past."""
@@ -89,9 +86,13 @@ class CommandRecord:
         )
 
     def part(self, first: int, last: int) -> "CommandRecord":
+        """Returns the record of some neighbouring ones of the N simulations."""
+        return self.of(slice(first, last))
+
+    def of(self, index: Tensor | slice) -> "CommandRecord":
         """Returns the record of some of the N simulations."""
         part = copy.copy(self)
-        part.rows = self.rows[first:last]
+        part.rows = self.rows[index]
         part._batch_shape = None
         return part
 

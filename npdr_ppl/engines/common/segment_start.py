@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.alike import alike
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, commands_at
 from npdr_ppl.engines.common.effect_chain import EffectChain
@@ -178,8 +179,10 @@ def with_past_commands(
         records: Commands of each action channel.
         num_steps: Number of past steps that were recorded.
     """
-    if chain.actions.effects:
-        for step in range(-num_steps, 0):
-            views = tuple(record.view(step) for record in records)
-            state, _, _ = chain.actions.act(state, commands_at(records, step), tables, views)
-    return state
+    if not chain.actions.effects:
+        return state
+    few = alike(chain.actions, state, tables, records)
+    changed = few.state
+    for step in range(-num_steps, 0):
+        changed, _, _ = chain.actions.act_on_record(changed, few.records, step, few.tables)
+    return few.spread(state, changed)

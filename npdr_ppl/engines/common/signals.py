@@ -112,10 +112,11 @@ class Signals:
         state = with_past_commands(chain, state, tables, self._records, past)
         steps = []
         for step in range(self._inputs.num_steps):
-            commands = commands_at(self._records, step)
-            views = tuple(record.view(step) for record in self._records)
-            state, reached, _ = chain.actions.act(state, commands, tables, views)
-            steps.append(torch.stack([x.expand_as(commands[0]) for x in reached], dim=-1))
+            commands = list(commands_at(self._records, step))
+            state, changed, _ = chain.actions.act_on_record(state, self._records, step, tables)
+            for channel, action in changed.items():
+                commands[channel] = action.expand_as(commands[channel])
+            steps.append(torch.stack(commands, dim=-1))
         return torch.stack(steps, dim=-2)
 
     def readings(self, values: Tensor, initial_states: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npdr_ppl.engines.common.alike import alike
 from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, command_records, commands_at
@@ -195,21 +196,23 @@ class _Replay:
 
         Without action effects, the third axis has size 1.
         """
-        controls = self.commands[self.rows[first:last], :, None]
+        rows = self.rows[first:last]
         if not chain.actions.effects:
-            return controls
+            return self.commands[rows, :, None]
+        few = alike(chain.actions, state, tables, records)
+        state, tables, records = few.state, few.tables, few.records
+        controls = self.commands[rows[few.first.numpy()], :, None]
         controls = np.repeat(controls, chain.substeps, axis=2)
         past = chain.actions.num_past_steps(self.inputs.past_actions.shape[-2])
         state = with_past_commands(chain, state, tables, records, past)
         for k in range(self.inputs.num_steps):
-            commands = commands_at(records, k)
-            views = tuple(record.view(k) for record in records)
-            state, actions, moments = chain.actions.act(state, commands, tables, views)
-            means, _ = chain.actions.by_substep(actions, moments, chain.substeps)
+            state, actions, moments = chain.actions.act_on_record(state, records, k, tables)
+            reached = tuple(moments.get(channel) for channel in actions)
+            means, _ = chain.actions.by_substep(tuple(actions.values()), reached, chain.substeps)
             for part, present in enumerate(means):
-                for channel, action in enumerate(present):
+                for channel, action in zip(actions, present, strict=True):
                     controls[:, k, part, channel] = action.numpy()
-        return controls
+        return controls[few.kind.numpy()]
 
     def _step_by_step(
         self,
