@@ -116,7 +116,7 @@ class Judge:
         most = max(1, num_segments // PLANNING.fewest_segments)
         every = min(most, -(-PLANNING.batch * steps // PLANNING.most_steps))
         batch = min(PLANNING.batch, max(2, every * PLANNING.most_steps // steps))
-        return batch, every, max(1, min(batch // 2, PLANNING.most_steps // steps))
+        return batch, every, max(1, min(3 * batch // 4, PLANNING.most_steps // steps))
 
     def _default_length(self) -> int:
         """Returns the steps of a segment with which one such recording of a fast motion is cut."""

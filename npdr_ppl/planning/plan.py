@@ -240,6 +240,7 @@ def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
         explored.every,
         least=rollouts or 1,
         most=max(allowed, PLANNING.most_needed),
+        num_distinct=allowed,
     )
     chosen = every[:allowed]
     random = explored.random(len(chosen))

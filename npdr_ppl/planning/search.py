@@ -39,22 +39,27 @@ class _Ranked:
     """The best candidates so far, the best random ones, and the first ones."""
 
     def __init__(self) -> None:
-        self.elites: list[tuple[float, Candidate]] = []
+        self.best: list[tuple[float, Candidate]] = []
         self.varied: list[tuple[float, Candidate]] = []
         self.first: list[Candidate] = []
         self.num_judged = 0
 
     def add(self, candidates: list[Candidate], values: Array, *, are_random: bool) -> bool:
         """Adds candidates; returns whether one is better than the best so far."""
-        before = self.elites[0][0] if self.elites else -np.inf
+        before = self.best[0][0] if self.best else -np.inf
         self.num_judged += len(candidates)
         found = [(float(v), c) for v, c in zip(values, candidates, strict=True) if np.isfinite(v)]
-        self.elites = sorted([*self.elites, *found], key=lambda pair: -pair[0])
-        self.elites = self.elites[: PLANNING.elites]
+        self.best = sorted([*self.best, *found], key=lambda pair: -pair[0])
+        self.best = self.best[: PLANNING.most_rollouts]
         if are_random:
             self.first = [*self.first, *(c for _, c in found)][: PLANNING.most_rollouts]
             self.varied = list(self.elites)
-        return bool(self.elites) and self.elites[0][0] > before
+        return bool(self.best) and self.best[0][0] > before
+
+    @property
+    def elites(self) -> list[tuple[float, Candidate]]:
+        """Those that are refined."""
+        return self.best[: PLANNING.elites]
 
 
 def search_excitations(
@@ -96,8 +101,10 @@ def search_excitations(
         values = value_of(played) if candidates else np.zeros(0)
         if not ranked.add(candidates, values, are_random=is_first) and not is_first:
             step = max(PLANNING.least_step, PLANNING.shrink * step)
-    pool = [candidate for _, candidate in ranked.elites]
-    pool += [c for _, c in ranked.varied if not any(c is kept for kept in pool)]
+    pool: list[Candidate] = []
+    for _, candidate in (*ranked.elites, *ranked.varied, *ranked.best):
+        if not any(candidate is kept for kept in pool):
+            pool.append(candidate)
     return Found(tuple(pool), tuple(ranked.first), ranked.num_judged, has_stopped)
 
 

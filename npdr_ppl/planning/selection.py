@@ -20,24 +20,37 @@ def greedy(
     pool: Sequence[int],
     value_of: Callable[[list[int]], float],
     is_enough: Callable[[list[int]], bool],
+    *,
     most: int,
+    num_distinct: int,
 ) -> list[int]:
-    """Adds the member that gains most, again and again; a member may be chosen several times.
+    """Adds the member that gains most, again and again.
+
+    A rollout that is recorded twice tells less than predicted: the errors of encoders and of the
+    model are the same both times, so that they do not average out.
 
     Args:
         pool: Members to choose from.
         value_of: Value of a set.
         is_enough: Whether a set needs no further member.
         most: Greatest number of members.
+        num_distinct: Number of members that differ from each other, as far as there are enough.
     """
     chosen: list[int] = []
     while len(chosen) < most and not (chosen and is_enough(chosen)):
-        chosen.append(max(pool, key=lambda k: value_of([*chosen, k])))
+        unused = [k for k in pool if k not in chosen] if len(chosen) < num_distinct else []
+        chosen.append(max(unused or pool, key=lambda k: value_of([*chosen, k])))
     return chosen
 
 
 def rollouts_that_separate(
-    known: Known, shown: Shown, pool: Sequence[int], *, least: int, most: int
+    known: Known,
+    shown: Shown,
+    pool: Sequence[int],
+    *,
+    least: int,
+    most: int,
+    num_distinct: int,
 ) -> list[int]:
     """Returns the fewest candidates after which the right cause is expected to be named.
 
@@ -49,12 +62,20 @@ def rollouts_that_separate(
         pool: The candidates to choose from.
         least: Least number of rollouts.
         most: Greatest number of rollouts.
+        num_distinct: Number of rollouts that are recorded, which differ; with more it is only told
+            how many would be needed.
     """
 
     def is_enough(chosen: list[int]) -> bool:
         return len(chosen) >= least and chance_of(known, shown, chosen).right >= PLANNING.wanted
 
-    return greedy(pool, lambda chosen: certainty(known, shown, chosen), is_enough, most)
+    return greedy(
+        pool,
+        lambda chosen: certainty(known, shown, chosen),
+        is_enough,
+        most=most,
+        num_distinct=num_distinct,
+    )
 
 
 def rollouts_that_inform(
@@ -75,7 +96,7 @@ def rollouts_that_inform(
             for cause, added in zip(known.causes, information, strict=True)
         )
 
-    return greedy(pool, gain, lambda chosen: False, number)
+    return greedy(pool, gain, lambda chosen: False, most=number, num_distinct=number)
 
 
 def chance_of(known: Known, shown: Shown, chosen: Sequence[int]) -> Chance:

@@ -68,7 +68,9 @@ def chances_with_wider_limits(
             shown = explored.judge.shown(explored.played)
         except DataError:
             continue  # no motion with these limits can be simulated
-        chosen = rollouts_that_separate(known, shown, explored.every, least=number, most=number)
+        chosen = rollouts_that_separate(
+            known, shown, explored.every, least=number, most=number, num_distinct=number
+        )
         result.append(Wider(name, chance_of(known, shown, chosen).right))
         least_time = time.monotonic() - began
     return tuple(sorted(result, key=lambda one: one.chance, reverse=True))

@@ -58,6 +58,7 @@ def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
     assert len(found.random) == len(found.recording)
     more = plan_within_limits(known, limits, rollouts=3, rounds=2, seed=1)
     assert len(more.recording) == 3
+    assert len({commands.tobytes() for commands in more.recording.actions}) == 3
     if outlook.needed is not None and outlook.needed <= 3:
         assert more.outlook.needed == outlook.needed
     # Three rollouts show more of every pair than the first of them alone.
