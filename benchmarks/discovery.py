@@ -43,7 +43,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import candidate_effects
 from npdr_ppl.preparation.data_options import DataOptions
 
-SEEDS = {"tune": range(100), "test": range(1000, 1100)}
+SEEDS = {"tune": range(100), "test": range(1000, 1400)}
 """Seeds of both parts."""
 
 SEPARATIONS = (5.0, 10.0, 30.0)

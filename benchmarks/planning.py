@@ -96,6 +96,10 @@ def judge(task: Task, rounds: int) -> dict[str, Any]:
     begin = time.monotonic()
     try:
         case = make_case(task.rig, "one", chosen, strength=task.strength, seed=task.seed)
+        if RIGS[task.rig].rests_anywhere:
+            # No recording of it can then be of another kind.
+            same = make_case(task.rig, "inseparable", chosen, seed=task.seed).alternatives
+            case = replace(case, alternatives=(*case.alternatives, *same))
         row |= {"truth": list(case.names), "alternatives": [list(a) for a in case.alternatives]}
         first = _first(case, task)
         found = npdr.discover(case.model, first, seed=task.seed, progress=False)

@@ -59,6 +59,8 @@ class Rig:
         same: Effects that no recording of the rig can tell from others, with these: alternatives,
             each one effect or several together.
         inseparable: Effects that recordings from rest cannot tell from others, with these.
+        rests_anywhere: Whether every pose is an equilibrium, so that all its recordings begin
+            at rest in one.
         outside: Effects that are in no catalogue.
         engine: What makes the truth: the equations, or MuJoCo with features of its own.
     """
@@ -84,6 +86,7 @@ class Rig:
     absorbed: tuple[Place, ...] = ()
     same: Mapping[Place, tuple[tuple[Place, ...], ...]] = field(default_factory=dict)
     inseparable: Mapping[Place, tuple[tuple[Place, ...], ...]] = field(default_factory=dict)
+    rests_anywhere: bool = False
     outside: tuple[Place, ...] = ()
     engine: Literal["equations", "mujoco"] = "equations"
 

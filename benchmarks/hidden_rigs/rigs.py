@@ -314,6 +314,7 @@ EMPS = Rig(
         **_one_of(("voltage", "input_delay"), ("position,velocity", "sensor_delay")),
         **_one_of(("voltage", "actuator_lag"), ("position,velocity", "sensor_low_pass")),
     },
+    rests_anywhere=True,
     same=_asymmetric("carriage"),
     outside=(*_at("carriage", _OUTSIDE_FORCE), *_at("voltage", _OUTSIDE_COMMAND)),
 )
