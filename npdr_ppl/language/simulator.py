@@ -118,6 +118,14 @@ class Simulator(ABC):
         return any(port.name == action and port.kind == "servo" for port in self.ports)
 
     @property
+    def estimated_speeds(self) -> Mapping[str, str]:
+        """Ports whose rated speed is a guess, and the state that is their joint's position.
+
+        None where the author of a model states it.
+        """
+        return {}
+
+    @property
     def rate_lag(self) -> float:
         """Time between the state's rates and the derivatives of its positions, in time steps."""
         return 0.0

@@ -1,13 +1,15 @@
 """Effects that may be added to a hypothesis, with priors that suit the recording's time step."""
 
 import numpy as np
+import pyro
 import pytest
-from pyro.distributions import LogNormal, Uniform
+from pyro.distributions import HalfNormal, LogNormal, Uniform
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.variants import candidates_at
-from npdr_ppl.models.effects import ActuatorLag, InputDelay
+from npdr_ppl.language.channels import Port
+from npdr_ppl.models.effects import ActuatorLag, CoulombFriction, InputDelay, QuadraticDrag
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
@@ -61,3 +63,46 @@ def test_priors_of_times_that_were_given_are_searched_as_they_are():
     given = (InputDelay("torque", priors={"delay": LogNormal(-4.0, 0.5)}),)
     found = priors_of_times(sampled(0.05), npdr.DiscoveryOptions(effects=given))
     assert found == {"torque.input_delay.delay": given[0].given_priors["delay"]}
+
+
+def test_coefficients_of_slow_joints_may_be_larger():
+    port = Port("hinge", "force", "N m", rated=2.0, rated_speed=20.0)
+    drag = QuadraticDrag("hinge")
+    own, slow = (e.priors(port)["drag"].variance.sqrt() for e in (drag, drag.at_speed(port, 2.0)))
+    assert float(slow / own) == pytest.approx(100.0)
+    assert drag.at_speed(port, 30.0) is drag
+    given = QuadraticDrag("hinge", priors={"drag": HalfNormal(1e-3)})
+    assert given.at_speed(port, 2.0) is given
+    dry = CoulombFriction("hinge")
+    assert dry.at_speed(port, 2.0) is dry
+
+
+def test_a_search_takes_the_speed_of_a_robots_joints_from_the_recording(tmp_path):
+    """Its file says how much torque a motor has, but not how fast the joint moves."""
+    xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 0 1"/>
+      <geom size="0.1" mass="1"/></body></worldbody>
+      <actuator><motor joint="hinge" ctrlrange="-40 40"/></actuator></mujoco>"""
+    (tmp_path / "robot.xml").write_text(xml)
+    robot = npdr.MujocoSimulator(tmp_path / "robot.xml", {"mass": "body body_1 mass"})
+
+    def model(inputs):
+        mass = pyro.sample("mass", Uniform(0.5, 2.0))
+        return npdr.simulate("trajectory", robot, {"mass": mass}, inputs)
+
+    time = 0.01 * np.arange(81)
+    rollouts = Rollouts.from_arrays(
+        readings=np.stack([0.2 * np.sin(6.0 * time)], -1)[None],
+        actions=np.zeros((1, 80, 1)), channel_names=("hinge",),
+        action_names=tuple(action.name for action in robot.actions), time_step=0.01,
+    )  # fmt: skip
+    hypothesis = fit_hypothesis(model, rollouts, DataOptions(None, 20), max_steps=0)
+    port = robot.port("hinge_torque")
+    assert port.rated_speed > 20.0
+    drag = next(
+        e for e in candidates_at(hypothesis, npdr.DiscoveryOptions()) if e.id == "quadratic_drag"
+    )
+    # The recording reaches 1.2 rad/s.
+    expected = 0.1 * port.rated
+    assert float(drag.priors(port)["drag"].variance.sqrt()) == pytest.approx(
+        float(HalfNormal(expected).variance.sqrt()), rel=0.01
+    )

@@ -633,3 +633,17 @@ def test_a_centre_of_mass_at_several_joints_that_would_not_move_is_refused(tmp_p
     )
     with pytest.raises(ModelError, match="centre of mass of body 'rod' cannot be changed"):
         simulator.simulate({"centre": torch.tensor([0.1]).double()}, inputs)
+
+
+def test_the_rated_speed_of_a_joint_does_not_depend_on_the_files_pose(tmp_path):
+    """An arm that points upwards has almost no inertia about its vertical axis."""
+    text = """<mujoco><worldbody><body><joint name="base" axis="0 0 1" range="-180 180"/>
+      <geom size="0.05" mass="1"/><body><joint name="shoulder" axis="0 1 0" range="-90 90"/>
+      <geom type="capsule" size="0.02" fromto="{pose}" mass="2"/></body></body></worldbody>
+      <actuator><motor joint="base" ctrlrange="-10 10"/></actuator></mujoco>"""
+    speeds = []
+    for pose in ("0 0 0 0 0 1", "0 0 0 1 0 0"):
+        (tmp_path / "arm.xml").write_text(text.format(pose=pose))
+        speeds.append(MujocoSimulator(tmp_path / "arm.xml", {}).port("base_torque").rated_speed)
+    up, along = speeds
+    assert up == pytest.approx(along, rel=0.3)

@@ -1,5 +1,6 @@
 """Effects that may be added to a hypothesis, in all their shapes, and what each would change."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -29,11 +30,31 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
     else:
         candidates = irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
     simulator, time_step = hypothesis.simulator, hypothesis.segments.inputs.time_step
-    return tuple(
-        effect.at_rate(simulator.port(effect.port), time_step)
-        for effect in candidates
-        if not effect.is_noise
-    )
+    speeds, result = _recorded_speeds(hypothesis), []
+    for effect in candidates:
+        if not effect.is_noise:
+            port = simulator.port(effect.port)
+            effect = effect.at_rate(port, time_step)
+            result.append(effect.at_speed(port, speeds.get(effect.port, port.rated_speed)))
+    return tuple(result)
+
+
+def _recorded_speeds(hypothesis: Hypothesis) -> dict[str, float]:
+    """Returns the greatest speed in the recording at ports whose rated speed is a guess.
+
+    It is that of the segments' starts, rounded down to a power of two: initial states are
+    estimated several times, and priors should not change with each estimate.
+    """
+    inputs, result = hypothesis.segments.inputs, {}
+    if inputs.initial_rates is None:
+        return result
+    for port, position in hypothesis.simulator.estimated_speeds.items():
+        if position in inputs.channel_names:
+            rates = inputs.initial_rates[..., inputs.channel_names.index(position)]
+            speed = float(rates.abs().max())
+            if 0.0 < speed < math.inf:
+                result[port] = 2.0 ** math.floor(math.log2(speed))
+    return result
 
 
 def variants_of(

@@ -120,6 +120,19 @@ class MujocoMechanism(ClosedLoopSimulator):
         """Names of the force ports."""
         return tuple(port.port.name for port in self.force_ports)
 
+    @property
+    def estimated_speeds(self) -> dict[str, str]:
+        """All force ports: an MJCF does not tell how fast its joints move."""
+        return self.position_states
+
+    @property
+    def position_states(self) -> dict[str, str]:
+        """State that is the position of the joint at each force port, if there is one."""
+        states = zip(self.components, self.states, strict=True)
+        names = {c.address: state.name for c, state in states if not c.is_velocity}
+        ports = self.force_ports
+        return {p.port.name: names[p.position] for p in ports if p.position in names}
+
     def recorded_settings(self) -> dict[str, Any]:
         """Returns the MJCF's text, the fields that parameters set, and the engine's version."""
         return {

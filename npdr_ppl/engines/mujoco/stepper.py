@@ -149,9 +149,8 @@ class MujocoStepper(EffectChain):
     @property
     def position_channels(self) -> tuple[str | None, ...]:
         """Name of the state that is the position of each hinge and slide."""
-        states = zip(self.simulator.components, self.simulator.states, strict=True)
-        names = {c.address: state.name for c, state in states if not c.is_velocity}
-        return tuple(names.get(port.position) for port in self.simulator.force_ports)
+        names = self.simulator.position_states
+        return tuple(names.get(joint) for joint in self.simulator.joints)
 
     def true_readings(
         self, positions: Components, velocities: Components, tables: Tables

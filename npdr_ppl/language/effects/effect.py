@@ -4,6 +4,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import torch
@@ -136,10 +137,35 @@ class Effect(ABC):
             and parameter.name not in self._priors
             and upper_end(self.priors(port)[parameter.name]) < longest
         }
-        if not wider:
+        return self._with_further_priors(wider)
+
+    def at_speed(self, port: Port, speed: float) -> Self:
+        """Returns the effect with priors that are as wide as at a lower rated speed.
+
+        A force in proportion to the square of the velocity has a coefficient that is a hundred
+        times as large if the same force acts at a tenth of the velocity. Priors that the user
+        gave, and wider ones, are kept.
+
+        Args:
+            port: The port it attaches to.
+            speed: Greatest speed of its joint in the recording.
+        """
+        if not 0.0 < speed < port.rated_speed:
+            return self
+        own = self.default_priors(port)
+        wider = {
+            name: prior
+            for name, prior in self.default_priors(replace(port, rated_speed=speed)).items()
+            if name not in self._priors and bool(prior.variance > own[name].variance)
+        }
+        return self._with_further_priors(wider)
+
+    def _with_further_priors(self, priors: Mapping[str, Distribution]) -> Self:
+        """Returns a copy with further priors; the effect itself if there are none."""
+        if not priors:
             return self
         changed = copy.copy(self)
-        changed._priors = {**self._priors, **wider}
+        changed._priors = {**self._priors, **priors}
         return changed
 
     def probe(self, port: Port) -> dict[str, float]:
