@@ -81,8 +81,8 @@ def discover(
     repeat: Annotated[
         bool,
         typer.Option(
-            help="Name only effects that each half of the recording shows and, with three "
-            "rollouts or more, that are found whichever rollout is left out.",
+            help="Name only effects that a half of the recording shows and that no part of it "
+            "contradicts: neither half nor, with three rollouts or more, all but one rollout.",
         ),
     ] = True,
     learn: Annotated[

@@ -42,6 +42,7 @@ def show_discovery(found: Mapping[str, Any], out: Path) -> None:
 
 def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     # Not at the top: other commands show their results without them.
+    from npdr_ppl.discovery.headline import told_doubt
     from npdr_ppl.discovery.proof.estimated_anew import ANEW
 
     if found["effects"]:
@@ -77,7 +78,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         if uncompared:
             console.print(f"Not compared with alternatives: {escape(', '.join(uncompared))}.")
         for effect in found["effects"]:
-            if doubt := effect.get("doubt"):
+            if doubt := told_doubt(effect):
                 name = f"{effect['port']}.{effect['effect']}"
                 console.print(escape(f"{name} {doubt}."))
     if found.get("learned"):

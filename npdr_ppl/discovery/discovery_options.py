@@ -22,8 +22,9 @@ class DiscoveryOptions:
         max_effects: Greatest number of effects to add; one law at three joints or more is one.
         false_alarm_rate: Probability that an alarm fires although nothing is missing.
         confidence: Probability above which one cause is named.
-        repeat: Whether each effect must also be found in each half of the recording and, with
-            three rollouts or more, whichever rollout is left out; otherwise it is not named.
+        repeat: Whether a half of the recording must show each effect, and no part of it may
+            contradict it: neither half nor, with three rollouts or more, all but one rollout.
+            Otherwise it is not named.
         learn: Whether a law is learned if no effect of the catalogue explains the recording.
         symmetry: Symmetry of a law that is learned: ``"odd"`` if mirrored motion and commands
             mirror it, ``"even"`` if they do not change it, ``None`` if it may have none.

@@ -7,10 +7,24 @@ from npdr_ppl.drawing.bars_html import METRICS
 from npdr_ppl.drawing.effect_names import effect_label, in_words
 from npdr_ppl.drawing.numbers import number
 
-__all__ = ["headline"]
+__all__ = ["headline", "told_doubt"]
 
 MOST_NAMED = 3
 """Maximum number of effects that the headline names; of more, only the number is given."""
+
+
+def told_doubt(effect: Mapping[str, Any]) -> str:
+    """Returns why an effect was not found again, to follow its name in a sentence.
+
+    Empty if it was. Earlier versions named no effect that any part of the recording does not show.
+
+    Args:
+        effect: The effect in ``discovery.json``.
+    """
+    if "doubt" in effect:
+        return str(effect["doubt"] or "")
+    parts = [part["part"] for part in effect.get("found_in") or [] if not part["is_found"]]
+    return f"was not found in {parts[0]}" if parts else ""
 
 
 def headline(result: Mapping[str, Any]) -> tuple[str, str]:
@@ -22,7 +36,7 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
     word = str(result.get("verdict", "no verdict"))
     effects = result.get("effects") or []
     large = [
-        effect for effect in effects if not effect.get("is_minor") and not effect.get("doubt")
+        effect for effect in effects if not effect.get("is_minor") and not told_doubt(effect)
     ] or effects
     labels = [effect_label(effect) for effect in large]
     p_value = number((result.get("alarm") or {}).get("p_value"))

@@ -22,8 +22,8 @@ class Found:
     """The result of a search.
 
     Attributes:
-        pool: The best candidates, the best first, and the best random ones among them, which
-            differ more; none if none was within the limits.
+        pool: The candidates that were refined last, the best first; the best random ones, which
+            differ more; and further good ones. None if none was within the limits.
         random: The first random candidates within the limits: random recordings.
         num_judged: Number of candidates that were judged.
         has_stopped: Whether the time limit ended the search.

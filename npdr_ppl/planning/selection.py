@@ -26,8 +26,8 @@ def greedy(
 ) -> list[int]:
     """Adds the member that gains most, again and again.
 
-    A rollout that is recorded twice tells less than predicted: the errors of encoders and of the
-    model are the same both times, so that they do not average out.
+    A rollout that is recorded twice tells less than predicted: the errors of encoders are the same
+    both times, so that they do not average out.
 
     Args:
         pool: Members to choose from.
@@ -62,8 +62,8 @@ def rollouts_that_separate(
         pool: The candidates to choose from.
         least: Least number of rollouts.
         most: Greatest number of rollouts.
-        num_distinct: Number of rollouts that are recorded, which differ; with more it is only told
-            how many would be needed.
+        num_distinct: Number of rollouts that are recorded, which differ. Further ones are only
+            counted.
     """
 
     def is_enough(chosen: list[int]) -> bool:

@@ -127,6 +127,14 @@ class SegmentModel:
             return None
         return starts.scaled(segments.inputs, error_factors(now.residual, now.by_starts))
 
+    @property
+    def recorded_rates(self) -> Tensor | None:
+        """The smoother's rates of the channels at the segments' starts, ``(S, C)``.
+
+        ``None`` if they are not estimated. :meth:`starting_from` does not change them.
+        """
+        return self._cut.initial_rates
+
     def along(self, index: Tensor) -> "SegmentModel":
         """Returns the model along some of the segments.
 

@@ -99,9 +99,8 @@ def test_fits_confirm_that_a_part_does_not_show_an_effect(rubbed_late, monkeypat
     assert (first.part, second.part) == HALVES
     assert first.probability < 0.5 < REPEATABILITY.certain_probability < second.probability
     halves = len(search.final.fit.offsets) // 2
-    # In the first half, the model with the effect, without it, and possibly with another law; in
-    # the rest, which is as long, the first two.
-    assert 4 <= fitted.count(halves) <= 5
+    # In the first half, the model with the effect, without it, and possibly with another law.
+    assert 2 <= fitted.count(halves) <= 3
 
     def never_moves(step, index):
         return step._whole.along(index), 0.0
@@ -163,7 +162,7 @@ def test_a_part_that_is_too_weak_to_show_an_effect_does_not_contradict_it():
     assert doubt_of([]) == ""
     assert doubt_of([weak, shown]) == ""
     assert doubt_of([weak, PartResult(second, False, 0.4)]) == (
-        "was not found in either half of the recording alone"
+        "was not found in the first half or the second half alone"
     )
     against = PartResult(first, False, 0.1, contradicts=True)
     assert doubt_of([against, shown]) == f"is contradicted by {first} of the recording"

@@ -81,7 +81,7 @@ def test_a_search_takes_the_speed_of_a_robots_joints_from_the_recording(tmp_path
     """Its file says how much torque a motor has, but not how fast the joint moves."""
     xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 0 1"/>
       <geom size="0.1" mass="1"/></body></worldbody>
-      <actuator><motor joint="hinge" ctrlrange="-40 40"/></actuator></mujoco>"""
+      <actuator><motor joint="hinge" ctrlrange="-1 1"/></actuator></mujoco>"""
     (tmp_path / "robot.xml").write_text(xml)
     robot = npdr.MujocoSimulator(tmp_path / "robot.xml", {"mass": "body body_1 mass"})
 
@@ -102,7 +102,6 @@ def test_a_search_takes_the_speed_of_a_robots_joints_from_the_recording(tmp_path
         e for e in candidates_at(hypothesis, npdr.DiscoveryOptions()) if e.id == "quadratic_drag"
     )
     # The recording reaches 1.2 rad/s.
-    expected = 0.1 * port.rated
-    assert float(drag.priors(port)["drag"].variance.sqrt()) == pytest.approx(
-        float(HalfNormal(expected).variance.sqrt()), rel=0.01
-    )
+    expected = HalfNormal(0.1 * port.rated / 1.2**2)
+    ratio = drag.priors(port)["drag"].variance.sqrt() / expected.variance.sqrt()
+    assert 0.8 < float(ratio) < 1.5

@@ -140,6 +140,7 @@ def test_an_effect_that_a_half_contradicts_is_no_headline(runs, tmp_path):
             "is_found": False,
             "probability": 0.4,
             "instead": "",
+            "contradicts": False,
         },
     ]
     content["effects"][0]["doubt"] = "is contradicted by the second half of the recording"

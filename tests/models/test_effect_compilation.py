@@ -5,7 +5,14 @@ import torch
 
 from npdr_ppl.engines.common.compilation import has_compiler
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import Backlash, ParameterDrift, Payload, SensorDelay
+from npdr_ppl.models.effects import (
+    ActuatorLag,
+    Backlash,
+    InputDelay,
+    ParameterDrift,
+    Payload,
+    SensorDelay,
+)
 from npdr_ppl.models.pendulum import Pendulum
 
 
@@ -21,6 +28,8 @@ def test_effects_with_memory_compile():
         Backlash("hinge"),
         ParameterDrift("mass"),
         Payload("payload"),
+        ActuatorLag("torque"),
+        InputDelay("torque"),
     )
     inputs = Inputs.single(
         3.0 * torch.sin(torch.arange(30.0, dtype=torch.float64))[:, None],

@@ -1,6 +1,5 @@
 """Effects that may be added to a hypothesis, in all their shapes, and what each would change."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -17,6 +16,10 @@ from npdr_ppl.language.effects import Effect
 from npdr_ppl.models.effects import candidate_effects
 
 __all__ = ["candidates_at", "variants_of"]
+
+LEAST_SPEED = 0.03
+"""Smallest speed for which priors are widened, as a share of the rated speed. Arms with 12 rad/s
+by their files move at 0.5 rad/s or more in the recordings of ``benchmarks/servo_arms.py``."""
 
 PARTS_PER_PROCESS = 4
 """Parts of the candidates per process, which it computes one after another. The changes of a part
@@ -40,20 +43,20 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
 
 
 def _recorded_speeds(hypothesis: Hypothesis) -> dict[str, float]:
-    """Returns the greatest speed in the recording at ports whose rated speed is a guess.
+    """Returns the greatest speed at a segment's start at ports whose rated speed is a guess.
 
-    It is that of the segments' starts, rounded down to a power of two: initial states are
-    estimated several times, and priors should not change with each estimate.
+    It is at least ``LEAST_SPEED`` of the rated one: the rates of a joint that only trembles are
+    noise.
     """
-    inputs, result = hypothesis.segments.inputs, {}
-    if inputs.initial_rates is None:
+    segments, result = hypothesis.segments, {}
+    if segments.recorded_rates is None:
         return result
+    channels = segments.inputs.channel_names
     for port, position in hypothesis.simulator.estimated_speeds.items():
-        if position in inputs.channel_names:
-            rates = inputs.initial_rates[..., inputs.channel_names.index(position)]
-            speed = float(rates.abs().max())
-            if 0.0 < speed < math.inf:
-                result[port] = 2.0 ** math.floor(math.log2(speed))
+        if position in channels:
+            rates = segments.recorded_rates[..., channels.index(position)]
+            least = LEAST_SPEED * hypothesis.simulator.port(port).rated_speed
+            result[port] = max(least, float(rates.nan_to_num(0.0).abs().max()))
     return result
 
 

@@ -17,9 +17,10 @@ be another one with what the other models' steps failed to gain, fits of the par
 the result is not certain, and before every "not found".
 
 A part in which the robot hardly moves may be too weak to show an effect: a spring that hardens
-needs large angles. It contradicts the effect only if the evidence for it is smaller by a factor α
-in the whole recording than in the rest alone. With the true law this factor of a part, given the
-rest, is below α with a probability of at most α, however much or little the part can show.
+needs large angles. It contradicts the effect if another law explains it clearly better, or if
+the effect gains less log density in the whole recording than in the rest alone, by more than
+−ln α with α = ``EVIDENCE.least_probability``. With the true law, the Bayes factor of a part, given
+the rest, is below α with a probability of at most α, however much or little the part can show.
 """
 
 import math
@@ -123,9 +124,9 @@ def doubt_of(found_in: Sequence[PartResult]) -> str:
             where = f"{each.part} of the recording" if each.part in HALVES else each.part
             better = f", which {each.instead} explains better" if each.instead else ""
             return f"is contradicted by {where}{better}"
-    in_halves = [each.is_found for each in found_in if each.part in HALVES]
-    if in_halves and not any(in_halves):
-        return "was not found in either half of the recording alone"
+    sought = [each for each in found_in if each.part in HALVES] or list(found_in)
+    if sought and not any(each.is_found for each in sought):
+        return "was not found in " + " or ".join(each.part for each in sought) + " alone"
     return ""
 
 
@@ -179,21 +180,27 @@ class _Compared:
         return replace(result, contradicts=self._is_less_likely_with(index))
 
     def _is_less_likely_with(self, index: Tensor) -> bool:
-        """Returns whether a part lowers the evidence for the effect that the rest gives.
+        """Returns whether the effect gains clearly less in the whole recording than in the rest.
 
-        The prior is the posterior of the rest, so a part that shows nothing changes nothing.
+        Each gain is that in log density at the closest fit. A part that does not show the effect
+        changes the gain little.
 
         Args:
             index: The part's segments.
         """
         assert self._without is not None
         own, rest = self._trials[self._effect.name], _others(index, self._without)
-        steps = self._closest(rest)
-        if not {self._effect.name, ""} <= steps.keys():
-            return False
-        without, with_it = (_refitted(steps[name][0]) for name in ("", self._effect.name))
-        gain = _gain(self._without, own, own) - _gain(without, with_it, own)
-        return gain < math.log(EVIDENCE.least_probability)
+        whole = _loss(self._without, own) - _loss(own, own)
+        losses = []
+        for model in (self._without, own):
+            here = model.along(rest)
+            here.keep_difference(model.difference[rest])
+            found = Trials(here.segments).refitted_along(here.segments, here, here.effects)
+            if found is None:
+                return False
+            # Each fit has a scale of its own, so that it need not be the best one at this scale.
+            losses.append(min(_loss(here, own), _loss(found, own)))
+        return whole - (losses[0] - losses[1]) < math.log(EVIDENCE.least_probability)
 
     def _closest(self, index: Tensor) -> dict[str, tuple[Hypothesis, float]]:
         """Returns the models with the least loss along a part, see :meth:`_Step.along`."""
@@ -249,20 +256,15 @@ def _others(index: Tensor, hypothesis: Hypothesis) -> Tensor:
     return is_other.nonzero()[:, 0]
 
 
-def _gain(without: Hypothesis, own: Hypothesis, reference: Hypothesis) -> float:
-    """Returns by how much an effect raises the log density at the fit, the prior included.
+def _loss(model: Hypothesis, reference: Hypothesis) -> float:
+    """Returns minus the log density of a fit, the prior included.
 
     Args:
-        without: The fitted model without it.
-        own: The fitted model with it.
+        model: The fitted model.
         reference: The model whose residuals give the scale and the share.
     """
-    scale, share = reference.fit.scale, reference.share
-    before, after = (
-        share * float(model.losses(scale).sum()) + 0.5 * float(model.fit.z.square().sum())
-        for model in (without, own)
-    )
-    return before - after
+    misfit = reference.share * float(model.losses(reference.fit.scale).sum())
+    return misfit + 0.5 * float(model.fit.z.square().sum())
 
 
 def _refitted(part: Hypothesis) -> Hypothesis:

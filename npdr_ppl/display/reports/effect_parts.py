@@ -138,7 +138,10 @@ def _shown_in(part: Mapping[str, Any]) -> str:
     """Returns what a part of the recording says about an effect."""
     if part.get("is_found"):
         return "yes"
-    return "no, contradicts it" if part.get("contradicts") else "no, too weak to show it"
+    if part.get("contradicts") or part.get("instead"):
+        return "no, contradicts it"
+    # Earlier versions did not tell the two apart.
+    return "no, too weak to show it" if "contradicts" in part else "no"
 
 
 def _alternatives(effects: Rows) -> list[Part]:

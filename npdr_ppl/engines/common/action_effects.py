@@ -159,7 +159,8 @@ class ActionEffects:
             tables: Constants of the simulation.
             views: Views of the recorded commands by channel; empty if they are not recorded.
         """
-        present, moments = dict(commands), dict[int, Tensor]()
+        present = dict(commands)
+        moments: dict[int, Tensor] = {}
         memory, past = list(state.action_memory), list(state.past_commands)
         is_raw = dict.fromkeys(present, True)
         for k, (place, effect, channel) in enumerate(self.effects):

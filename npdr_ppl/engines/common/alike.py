@@ -54,7 +54,8 @@ def alike(
     """Returns one simulation of each kind.
 
     Simulations are alike if they have the same segment of the recording and the same parameters
-    of the effects on commands.
+    of the effects on commands. If those have gradients, every simulation is a kind of its own:
+    equal values may come from different parameters.
 
     Args:
         actions: The effects on commands.
@@ -65,11 +66,14 @@ def alike(
     size = len(records[0].rows)
     own = [value for place, _, _ in actions.effects for value in tables.effects[place].values()]
     columns = [records[channel].rows for channel in actions.channels] + own
-    keys = torch.stack([c.detach().double().expand(size) for c in columns], dim=-1)
-    kinds, kind = torch.unique(keys, dim=0, return_inverse=True)
-    numbers = torch.arange(size, device=kind.device)
-    first = torch.full((len(kinds),), size, device=kind.device)
-    first = first.scatter_reduce(0, kind, numbers, "amin")
+    numbers = torch.arange(size, device=columns[0].device)
+    if any(value.requires_grad for value in own):
+        first = kind = numbers
+    else:
+        # Of each column the ranks of its values: its own type may not hold all others.
+        ranks = [torch.unique(c.expand(size), return_inverse=True)[1] for c in columns]
+        kinds, kind = torch.unique(torch.stack(ranks, dim=-1), dim=0, return_inverse=True)
+        first = numbers.new_full((len(kinds),), size).scatter_reduce(0, kind, numbers, "amin")
     return Alike(
         state._replace(
             action_memory=_taken(state.action_memory, first),

@@ -179,7 +179,7 @@ def with_past_commands(
         records: Commands of each action channel.
         num_steps: Number of past steps that were recorded.
     """
-    if not chain.actions.effects:
+    if not chain.actions.effects or not num_steps:
         return state
     few = alike(chain.actions, state, tables, records)
     changed = few.state

@@ -156,7 +156,7 @@ class Effect(ABC):
         wider = {
             name: prior
             for name, prior in self.default_priors(replace(port, rated_speed=speed)).items()
-            if name not in self._priors and bool(prior.variance > own[name].variance)
+            if name not in self._priors and _variance(prior) > _variance(own[name])
         }
         return self._with_further_priors(wider)
 
@@ -242,3 +242,11 @@ class Effect(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(port={self.port!r})"
+
+
+def _variance(prior: Distribution) -> float:
+    """Returns a prior's variance, infinite if it does not tell it."""
+    try:
+        return float(prior.variance)
+    except NotImplementedError:
+        return math.inf
