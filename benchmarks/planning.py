@@ -97,9 +97,10 @@ def judge(task: Task, rounds: int) -> dict[str, Any]:
     try:
         case = make_case(task.rig, "one", chosen, strength=task.strength, seed=task.seed)
         if RIGS[task.rig].rests_anywhere:
-            # No recording of it can then be of another kind.
-            same = make_case(task.rig, "inseparable", chosen, seed=task.seed).alternatives
-            case = replace(case, alternatives=(*case.alternatives, *same))
+            # What recordings from rest cannot tell apart, none of its recordings can.
+            same = RIGS[task.rig].inseparable.get(chosen[0], ())
+            names = (tuple(f"{port}.{effect}" for port, effect in group) for group in same)
+            case = replace(case, alternatives=(*case.alternatives, *names))
         row |= {"truth": list(case.names), "alternatives": [list(a) for a in case.alternatives]}
         first = _first(case, task)
         found = npdr.discover(case.model, first, seed=task.seed, progress=False)

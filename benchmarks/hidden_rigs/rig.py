@@ -59,8 +59,8 @@ class Rig:
         same: Effects that no recording of the rig can tell from others, with these: alternatives,
             each one effect or several together.
         inseparable: Effects that recordings from rest cannot tell from others, with these.
-        rests_anywhere: Whether every pose is an equilibrium, so that all its recordings begin
-            at rest in one.
+        rests_anywhere: Whether every pose is an equilibrium, so that every recording begins at
+            rest in one.
         outside: Effects that are in no catalogue.
         engine: What makes the truth: the equations, or MuJoCo with features of its own.
     """

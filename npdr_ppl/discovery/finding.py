@@ -48,7 +48,7 @@ class Finding:
 
     @property
     def is_found_again(self) -> bool:
-        """Whether no part of the recording contradicts it."""
+        """Whether its strengths in parts of the recording do not contradict each other."""
         return self.repetition is None or self.repetition.is_found_again
 
     @property

@@ -118,10 +118,10 @@ class Simulator(ABC):
         return any(port.name == action and port.kind == "servo" for port in self.ports)
 
     @property
-    def estimated_speeds(self) -> Mapping[str, str]:
-        """Ports whose rated speed is a guess, and the state that is their joint's position.
+    def joints_of_unknown_speed(self) -> Mapping[str, str]:
+        """Force ports whose rated speed is a guess, and the state that is their joint's position.
 
-        None where the author of a model states it.
+        There are none where the author of the model states the speeds.
         """
         return {}
 

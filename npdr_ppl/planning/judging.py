@@ -116,6 +116,7 @@ class Judge:
         most = max(1, num_segments // PLANNING.fewest_segments)
         every = min(most, -(-PLANNING.batch * steps // PLANNING.most_steps))
         batch = min(PLANNING.batch, max(2, every * PLANNING.most_steps // steps))
+        # Of a batch of 12, the nine of Found.pool; fewer of large simulations.
         return batch, every, max(1, min(3 * batch // 4, PLANNING.most_steps // steps))
 
     def _default_length(self) -> int:

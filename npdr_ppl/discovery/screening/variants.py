@@ -52,7 +52,7 @@ def _recorded_speeds(hypothesis: Hypothesis) -> dict[str, float]:
     if segments.recorded_rates is None:
         return result
     channels = segments.inputs.channel_names
-    for port, position in hypothesis.simulator.estimated_speeds.items():
+    for port, position in hypothesis.simulator.joints_of_unknown_speed.items():
         if position in channels:
             rates = segments.recorded_rates[..., channels.index(position)]
             least = LEAST_SPEED * hypothesis.simulator.port(port).rated_speed

@@ -121,7 +121,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         return tuple(port.port.name for port in self.force_ports)
 
     @property
-    def estimated_speeds(self) -> dict[str, str]:
+    def joints_of_unknown_speed(self) -> dict[str, str]:
         """All force ports: an MJCF does not tell how fast its joints move."""
         return self.position_states
 
