@@ -10,7 +10,7 @@ def worth(chosen):
 
 
 def test_rollouts_differ_as_long_as_there_are_candidates():
-    """The errors of encoders and of the model are the same whenever a rollout is repeated."""
+    """The errors of encoders are the same whenever a rollout is repeated."""
     chosen = greedy([0, 1, 2], worth, lambda chosen: False, most=3, num_distinct=3)
     assert chosen == [0, 1, 2]
     more = greedy([0, 1, 2], worth, lambda chosen: False, most=5, num_distinct=5)
