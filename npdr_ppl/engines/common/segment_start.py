@@ -15,7 +15,13 @@ from npdr_ppl.engines.common.measurement_times import catch_up, sensor_leads
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
 
-__all__ = ["RecordedStart", "recorded_start", "true_start", "with_past_commands"]
+__all__ = [
+    "RecordedStart",
+    "after_past_commands",
+    "recorded_start",
+    "true_start",
+    "with_past_commands",
+]
 
 
 class RecordedStart(NamedTuple):
@@ -182,7 +188,18 @@ def with_past_commands(
     if not chain.actions.effects or not num_steps:
         return state
     few = alike(chain.actions, state, tables, records)
-    changed = few.state
-    for step in range(-num_steps, 0):
-        changed, _, _ = chain.actions.act_on_record(changed, few.records, step, few.tables)
+    changed = after_past_commands(chain, few.state, few.tables, few.records, num_steps)
     return few.spread(state, changed)
+
+
+def after_past_commands(
+    chain: EffectChain,
+    state: State,
+    tables: Tables,
+    records: tuple[CommandRecord, ...],
+    num_steps: int,
+) -> State:
+    """Returns the same as :func:`with_past_commands`, from each simulation's own commands."""
+    for step in range(-num_steps, 0):
+        state, _, _ = chain.actions.act_on_record(state, records, step, tables)
+    return state

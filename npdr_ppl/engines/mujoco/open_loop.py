@@ -20,7 +20,7 @@ from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, command_records, commands_at
 from npdr_ppl.engines.common.past_motion import PastMotion, past_motion
-from npdr_ppl.engines.common.segment_start import recorded_start, true_start, with_past_commands
+from npdr_ppl.engines.common.segment_start import after_past_commands, recorded_start, true_start
 from npdr_ppl.engines.mujoco.batches import quiet
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.native import run_all_steps
@@ -204,7 +204,7 @@ class _Replay:
         controls = self.commands[rows[few.first.numpy()], :, None]
         controls = np.repeat(controls, chain.substeps, axis=2)
         past = chain.actions.num_past_steps(self.inputs.past_actions.shape[-2])
-        state = with_past_commands(chain, state, tables, records, past)
+        state = after_past_commands(chain, state, tables, records, past)
         for k in range(self.inputs.num_steps):
             state, actions, moments = chain.actions.act_on_record(state, records, k, tables)
             reached = tuple(moments.get(channel) for channel in actions)
