@@ -110,7 +110,8 @@ def test_what_a_command_takes_is_its_own():
     assert outcome.exit_code == 0
     assert outcome.message == ""
     assert size < outcome.peak_bytes < size + 60 * 2**20
-    assert 0.5 <= outcome.cpu_seconds < 1.0 <= outcome.seconds
+    # However busy the machine is, the time asleep is in the one and not in the other.
+    assert 0.5 <= outcome.cpu_seconds <= outcome.seconds - 0.6
 
 
 @pytest.mark.slow
