@@ -119,6 +119,9 @@ class IntegralAction(ServoEffect):
         Parameter("limit", "{coordinate}", math.inf, "greatest integral part w_max of the error"),
     )
     strength = ("rate",)
+    # At a typical rate the integral part is at its limit most of the time, at a small one hardly
+    # ever.
+    is_smooth = False
     law = "K (e + w), ẇ = r e, |w| ≤ w_max"
     excitation = "hold"
     reference = ASTROM_1995
