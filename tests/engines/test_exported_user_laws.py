@@ -257,8 +257,8 @@ class FilteredServo(ServoEffect):
         return error
 
     def act(self, error, parameters, memory):
-        """Takes the filtered error."""
-        return memory
+        """Takes half of the filtered error."""
+        return 0.5 * memory
 
     def next_memory(self, error, parameters, memory, time_step):
         """Approaches the error; at once if the time constant is zero."""

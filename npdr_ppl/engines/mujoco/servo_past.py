@@ -24,7 +24,8 @@ def with_recorded_past(
     """Returns the own states of servo effects at the start of segments.
 
     The first effect of a servo gets its error in every step since the rollout began: the recorded
-    goal minus the measured position. A later effect gets the error that the one before it gives.
+    goal minus the mean of the measured positions before and after the step. A later effect gets
+    the error that the one before it gives.
     Without a record, or if the joint's position was not measured, states stay those of a rollout's
     beginning.
 
@@ -75,9 +76,6 @@ def _errors(simulator: MujocoMechanism, inputs: Inputs, actuator: int) -> Tensor
         return None
     position = inputs.recorded_readings[..., inputs.channel_names.index(known[0])]
     goal = inputs.recorded_actions[..., inputs.action_names.index(action.name)]
-    # The engine evaluates errors at the starts of its steps, n in each step of the recording. The
-    # mean of a position there is (n − 1)/(2 n) of the way to the next measurement.
     later = torch.cat((position[:, 1:], position[:, -1:]), dim=1)
-    share = 0.5 - 0.5 / simulator.num_substeps(inputs.time_step)
-    errors = goal.clamp(action.lower, action.upper) - torch.lerp(position, later, share)
+    errors = goal.clamp(action.lower, action.upper) - 0.5 * (position + later)
     return errors.nan_to_num(0.0).T.contiguous()

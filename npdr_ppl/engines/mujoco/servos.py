@@ -89,13 +89,16 @@ def check_servo(model: Any, actuator: int, effect: str) -> None:
 class ServoErrors:
     """Changes the goals of position servos so that they act on the errors that effects give.
 
-    The servos act on a joint directly, with a gear of one.
+    The servos act on a joint directly, with a gear of one. A goal is constant during a step of the
+    engine. So effects act with their state in the middle of a step, and then get the error there:
+    with those at its start, an integral gain that is fitted is 3 % too small at 1 ms.
 
     Args:
         model: A ``mujoco.MjModel``.
         effects: Index in the tables, effect and number of the actuator of each effect.
         goals: The batch's live view of the commands, ``(N, actuators)``.
         positions: Its live view of ``qpos``.
+        velocities: Its live view of ``qvel``.
     """
 
     def __init__(
@@ -104,11 +107,13 @@ class ServoErrors:
         effects: Sequence[tuple[int, ServoEffect, int]],
         goals: NDArray[np.float64],
         positions: NDArray[np.float64],
+        velocities: NDArray[np.float64],
     ) -> None:
         self._effects = effects
-        self._goals, self._positions = goals, positions
+        self._goals, self._positions, self._velocities = goals, positions, velocities
         joints = {actuator: actuated_joint(model, actuator) for _, _, actuator in effects}
-        self._address = {a: int(model.jnt_qposadr[joint]) for a, joint in joints.items()}
+        self._position = {a: int(model.jnt_qposadr[joint]) for a, joint in joints.items()}
+        self._velocity = {a: int(model.jnt_dofadr[joint]) for a, joint in joints.items()}
 
     def initial_memory(self) -> tuple[Tensor | None, ...]:
         """Returns the own state of each effect as a rollout begins, at its servo's goal."""
@@ -125,15 +130,17 @@ class ServoErrors:
             memory: Own state of each effect.
             time_step: Seconds per engine step.
         """
-        later = []
+        later: list[Tensor | None] = []
+        means: dict[int, Tensor] = {}
         for (place, effect, actuator), own in zip(self._effects, memory, strict=True):
-            error, values = self._error(actuator), tables.effects[place]
-            changed = effect.act(error, values, own)
+            values = tables.effects[place]
+            position = self._positions[:, self._position[actuator]]
+            error = torch.from_numpy(self._goals[:, actuator] - position)
+            velocity = torch.from_numpy(self._velocities[:, self._velocity[actuator]])
+            mean = means.get(actuator, error - 0.5 * time_step * velocity)
+            middle = effect.next_memory(error, values, own, 0.5 * time_step)
+            changed = effect.act(error, values, middle)
             self._goals[:, actuator] += (changed - error).numpy()
-            later.append(effect.next_memory(error, values, own, time_step))
+            means[actuator] = effect.act(mean, values, middle)
+            later.append(effect.next_memory(mean, values, own, time_step))
         return tuple(later)
-
-    def _error(self, actuator: int) -> Tensor:
-        """Returns goal minus position, ``(N,)``."""
-        position = self._positions[:, self._address[actuator]]
-        return torch.from_numpy(self._goals[:, actuator] - position)

@@ -79,7 +79,9 @@ class MujocoStepper(EffectChain):
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
         self._applied = state_view(batch, "qfrc_applied") if self.forces.effects else None
-        self._servos = ServoErrors(simulator.model, servo_effects, self._ctrl, self._qpos)
+        self._servos = ServoErrors(
+            simulator.model, servo_effects, self._ctrl, self._qpos, self._qvel
+        )
         # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
         self._joints = (

@@ -40,9 +40,9 @@ class ServoEffect(Effect):
         """Returns the error on which the servo acts; evaluated in every step of the engine.
 
         Args:
-            error: Goal minus position, ``(N,)``.
+            error: Goal minus position at the start of the step, ``(N,)``.
             parameters: The effect's parameters by short name.
-            memory: The effect's own state at the start of the step.
+            memory: The effect's own state in the middle of the step.
         """
 
     def next_memory(
@@ -52,5 +52,5 @@ class ServoEffect(Effect):
         memory: Tensor | None,
         time_step: float,
     ) -> Tensor | None:
-        """Returns the effect's own state after a step of ``time_step`` seconds with an error."""
+        """Returns the effect's own state after ``time_step`` seconds with an error."""
         return memory

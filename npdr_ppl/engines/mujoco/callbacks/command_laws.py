@@ -243,11 +243,12 @@ class ServoLaw:
     def reset(self) -> None:
         """Sets the own state as a rollout begins."""
 
-    def act(self, error: float, step: float) -> float:
-        """Returns the error on which the servo acts.
+    def act(self, error: float, mean: float, step: float) -> tuple[float, float]:
+        """Returns the error on which the servo acts, and its mean during the step.
 
         Args:
-            error: Goal minus position.
+            error: Goal minus position at the start of an engine step.
+            mean: The same in the middle of the step.
             step: Seconds per engine step.
         """
         raise NotImplementedError
@@ -259,9 +260,9 @@ class ServoDeadBand(ServoLaw):
 
     width: float
 
-    def act(self, error: float, step: float) -> float:
-        """Returns the error on which the servo acts."""
-        return error - clip(error, self.width)
+    def act(self, error: float, mean: float, step: float) -> tuple[float, float]:
+        """Returns the error on which the servo acts, and its mean during the step."""
+        return error - clip(error, self.width), mean - clip(mean, self.width)
 
 
 @dataclass
@@ -276,8 +277,8 @@ class IntegralAction(ServoLaw):
         """Sets the integral part to zero."""
         self.integral = 0.0
 
-    def act(self, error: float, step: float) -> float:
-        """Returns the error on which the servo acts."""
-        acted = error + self.integral
-        self.integral = clip(self.integral + step * self.rate * error, self.limit)
-        return acted
+    def act(self, error: float, mean: float, step: float) -> tuple[float, float]:
+        """Returns the error on which the servo acts, and its mean during the step."""
+        middle = clip(self.integral + 0.5 * step * self.rate * error, self.limit)
+        self.integral = clip(self.integral + step * self.rate * mean, self.limit)
+        return error + middle, mean + middle

@@ -165,10 +165,14 @@ class LawRunner:
     def _substep(self, data: Any) -> None:
         """Advances the data by one engine step."""
         model = self.model
+        means: dict[int, float] = {}
         for law, i in self.servos:
-            position = float(data.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
+            joint, step = model.actuator_trnid[i, 0], float(model.opt.timestep)
+            position = float(data.qpos[model.jnt_qposadr[joint]])
             error = float(data.ctrl[i]) - position
-            data.ctrl[i] = position + law.act(error, float(model.opt.timestep))
+            mean = error - 0.5 * step * float(data.qvel[model.jnt_dofadr[joint]])
+            acted, means[i] = law.act(error, means.get(i, mean), step)
+            data.ctrl[i] = position + acted
         h, qpos, qvel, applied = model.opt.timestep, data.qpos, data.qvel, data.qfrc_applied
         middle = data.time + 0.5 * h
         joints = [Joint(float(qpos[q]), float(qvel[v]), middle, h) for _, q, v in self.forces]

@@ -263,22 +263,29 @@ def _servo(effect: ServoEffect) -> TracedLaw:
     recorder = Recorder()
     own, error = _parameters(effect, recorder), recorder.number("error")
     memory = _Memory(effect.initial_memory(error))
-    acted = effect.act(error, own, memory.stand_ins(recorder))
+    step: Any = recorder.number("step")
+    before = memory.stand_ins(recorder)
+    mean: Any = recorder.number("mean")
+    middle = effect.next_memory(error, own, before, 0.5 * step)
+    acted = [effect.act(each, own, middle) for each in (error, mean)]
     lines: list[str] = []
     if memory.leaves:
         lines += _MEMORY
         lines += ["", "    def reset(self) -> None:"]
         lines += ['        """Sets the state as a rollout begins, with no error."""']
         lines += _setting(recorder, memory.leaves, _AT_REST)
-    lines += ["", "    def act(self, error: float, step: float) -> float:"]
-    lines += ['        """Returns the error on which the servo acts."""']
-    step: Any = recorder.number("step")
-    later = effect.next_memory(error, own, memory.stand_ins(recorder), step)
-    statements, texts = _statements(recorder, [acted, *memory.leaves_of(later)], _OF_ERROR)
-    lines += [*statements, f"        acted = {texts[0]}"]
+    lines += [
+        "",
+        "    def act(self, error: float, mean: float, step: float) -> tuple[float, float]:",
+        '        """Returns the error on which the servo acts, and its mean during the step."""',
+    ]
+    later = effect.next_memory(mean, own, before, step)
+    statements, texts = _statements(recorder, [*acted, *memory.leaves_of(later)], _OF_ERROR)
+    lines += statements
+    lines += _assigned("acted", texts[:2])
     if memory.leaves:
-        lines += _assigned("self.memory", texts[1:])
-    lines += ["        return float(acted)"]
+        lines += _assigned("self.memory", texts[2:])
+    lines += ["        return acted"]
     return TracedLaw(type(effect).__name__, "ServoLaw", _class_body(effect, lines))
 
 
@@ -334,7 +341,11 @@ _OF_JOINT = {
 }
 _OF_COMMAND = {"start": "0.0", "command": "np.float64(command)", "step": "np.float64(step)"}
 _OF_VALUE = {"start": "0.0", "value": "np.float64(value)", "step": "np.float64(step)"}
-_OF_ERROR = {"error": "np.float64(error)", "step": "np.float64(step)"}
+_OF_ERROR = {
+    "error": "np.float64(error)",
+    "mean": "np.float64(mean)",
+    "step": "np.float64(step)",
+}
 _AT_REST = {"error": "np.float64(0.0)"}
 """Where each input of a law comes from, in the file. Numbers of numpy may be divided by zero, as
 those of torch."""
