@@ -3,7 +3,7 @@
 from clean_fits_conditions import made
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.search import base_fit, effect_search
+from npdr_ppl.discovery.search import base_fit, original_model
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.models.pendulum import pendulum
 
@@ -33,7 +33,7 @@ def test_a_rough_fit_is_fitted_to_convergence_once(monkeypatch):
     recording = made("pendulum", "clean", 1141).rollouts[[0, 1]]
     searcher = Searcher(pendulum, recording, npdr.DiscoveryOptions())
     given = searcher.fit_base(may_be_rough=True)
-    for module in (base_fit, effect_search):
+    for module in (base_fit, original_model):
         monkeypatch.setattr(module, "polished", once)
     # As where rough fits do not show which steps are likelier.
     monkeypatch.setattr(base_fit, "_are_likelier", lambda one, other: False)

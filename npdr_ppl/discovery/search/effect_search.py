@@ -1,10 +1,9 @@
 """The search: add the effect that explains most, screen again, remove effects no longer needed."""
 
-import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from typing import Self
 
 from torch import Tensor
 
@@ -14,30 +13,27 @@ from npdr_ppl.discovery.screening.groups import Group, num_counted
 from npdr_ppl.discovery.screening.projection import loss_without
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import Added, log_prior
-from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.likelier_group import likelier_group
 from npdr_ppl.discovery.search.look import look
+from npdr_ppl.discovery.search.original_model import OriginalModel
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
-from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
 from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
-from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
-from npdr_ppl.preparation.segment_model import SegmentModel
-from npdr_ppl.progress import Reporter, Step
+from npdr_ppl.progress import Reporter
 from npdr_ppl.rollouts import Rollouts
 
 __all__ = ["Searcher"]
 
 
-class Searcher:
+class Searcher(OriginalModel):
     """Searches a recording for missing effects.
 
     Args:
@@ -51,12 +47,7 @@ class Searcher:
         deadline: When to end with the best answer so far.
 
     Attributes:
-        rollouts: The recording.
         options: Settings of the search.
-        data_options: How the recording is cut into segments.
-        seed: Seed of all random numbers.
-        are_steps_coarse: Whether the model's own integration steps are too coarse.
-        are_priors_widened: Whether some of the model's priors were too narrow and were widened.
     """
 
     def __init__(
@@ -71,122 +62,21 @@ class Searcher:
         progress: Reporter | None = None,
         deadline: Deadline | None = None,
     ) -> None:
+        data_options = data_options or segment_options(rollouts)
+        super().__init__(model, rollouts, data_options, seed=seed, report=report)
         self._deadline = deadline or Deadline(options.time_limit)
-        self._model = model
-        self.rollouts = rollouts
         self.options = options
-        self.data_options: DataOptions = data_options or segment_options(rollouts)
-        self.seed = seed
-        self.are_steps_coarse = False
-        self.are_priors_widened = False
         self._last: Round | None = None
-        # Whether the last fit of the original model is rough, and where one in finer steps begins.
-        self._is_rough = False
-        self._finer_parameters: Mapping[str, Tensor] | None = None
-        self._report = report
         self._progress = progress or Reporter()
 
-    @cached_property
-    def base(self) -> SegmentModel:
-        """The original model along the recording, to which every hypothesis adds effects.
-
-        It has finer steps once its own were found to be too coarse, and wider priors once its own
-        were found to be too narrow.
-
-        Raises:
-            DataError: The recording does not fit the model.
-        """
-        return SegmentModel(self._model, self.rollouts, self.data_options)
-
-    @property
-    def trials(self) -> Trials:
-        """Fits of the model with its current integration steps and priors."""
-        return Trials(self.base)
-
-    def fit_base(
-        self,
-        *,
-        near: Mapping[str, Tensor] | None = None,
-        may_be_rough: bool = False,
-        progress: Step | None = None,
-    ) -> Hypothesis:
-        """Fits the original model; see :func:`~npdr_ppl.discovery.search.base_fit.fit_base`.
-
-        A rough fit must be followed by :meth:`settled`, or by :meth:`with_finer_steps` and
-        :meth:`converged`.
-        """
-        self._report("fitting the original model")
-        fitted, self._finer_parameters = fit_base(
-            self.base, near=near, seed=self.seed, may_be_rough=may_be_rough, progress=progress
-        )
-        self._is_rough = self._finer_parameters is not None
-        return fitted
-
-    def settled(self, given: Hypothesis) -> Hypothesis:
-        """Returns the fit with steps and priors that suffice; the given one if its own do.
-
-        All later hypotheses use the steps and priors of the returned one.
-
-        Args:
-            given: The fitted original model.
-        """
-        # Where a prior is too narrow, a precise fit takes many steps towards its end.
-        finer = self.with_finer_steps(given, is_rough=True)
-        wider = self.with_wider_priors(finer)
-        return self.converged(finer) if wider is finer else wider
-
-    def converged(self, current: Hypothesis) -> Hypothesis:
-        """Returns the last fit of the original model, after precise steps if it is rough."""
-        if not self._is_rough:
-            return current
-        self._is_rough = False
-        return polished(current)
-
-    def with_finer_steps(self, current: Hypothesis, *, is_rough: bool = False) -> Hypothesis:
-        """Returns a hypothesis with finer steps if its own are too coarse; else unchanged.
-
-        All later hypotheses use the steps of the returned one.
-
-        Args:
-            current: A fitted hypothesis.
-            is_rough: Whether a rough fit is enough.
-        """
-        near, self._finer_parameters = self._finer_parameters, None
-        found = in_finer_steps(
-            current, self.base, near=near, is_rough=is_rough, report=self._report
-        )
-        self.base = found.segments
-        is_new = found.hypothesis is not current
-        self._is_rough = is_rough and not found.is_polished and (self._is_rough or is_new)
-        self.are_steps_coarse = self.are_steps_coarse or found.are_steps_coarse
-        return found.hypothesis
-
-    def with_wider_priors(self, current: Hypothesis) -> Hypothesis:
-        """Returns a hypothesis with wider priors if its own are too narrow; else unchanged.
-
-        All later hypotheses use the priors of the returned one. So no effect is named if a wider
-        prior explains the same misfit.
-
-        Args:
-            current: A fitted hypothesis.
-        """
-        found = widen_where_it_helps(self.base, current)
-        if found is None:
-            return current
-        self._report(f"{found.ends[0]}")
-        self.base, self.are_priors_widened = found.segments, True
-        # The misfit caused by the narrow prior can hide that the steps are too coarse.
-        return self.with_finer_steps(found.hypothesis)
-
-    def along(self, index: Tensor) -> "Searcher":
+    def along(self, index: Tensor) -> Self:
         """Returns a searcher of some of the segments, with the current steps and priors.
 
         Args:
             index: Indices of the segments.
         """
-        part = copy.copy(self)
-        part.base = self.base.along(index)
-        part._last = part._finer_parameters = None
+        part = super().along(index)
+        part._last = None
         return part
 
     def run(self, first: Round, *, max_effects: int) -> Search:
