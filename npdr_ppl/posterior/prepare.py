@@ -2,7 +2,7 @@
 
 It estimates the initial states and their errors, finds the model's closest fit, refines
 integration steps that are too coarse, estimates noise that the model does not declare, and chooses
-features. ``discover`` shares its first part, the fit in ``discovery/search/base_fit.py``.
+features. ``discover`` shares its first part, the fit in ``discovery/search/original_model.py``.
 """
 
 import math

@@ -301,6 +301,16 @@ def test_an_effect_of_ones_own_is_reproduced_with_its_state(arm, tmp_path, kind)
     assert where == "Python" and error <= MOST and matters > 1e-3
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_two_laws_of_one_servo_are_reproduced(tmp_path, integrator):
+    (tmp_path / "arm.xml").write_text(ARM.format(integrator=integrator, friction=0.0, spring=""))
+    laws = SoftServo("servo"), FilteredServo("servo")
+    given = {"servo.soft_servo.width": 0.1, "servo.filtered_servo.time_constant": 0.05}
+    arm = MujocoSimulator(tmp_path / "arm.xml", time_step=0.01)
+    error, matters, where = difference(arm.with_effects(*laws), given, tmp_path)
+    assert where == "Python" and error <= MOST and matters > 1e-3
+
+
 class Branching(Creeping):
     """A law that cannot be followed, because it branches on a number."""
 

@@ -42,7 +42,7 @@ class Variant:
         deviation: Standard deviation of the priors in multiples of the size, by strength.
         change: Change of the whitened measurements per size, ``(S, N, k)``.
         is_hinted: Whether its shape was found on the recording itself.
-        is_linear: Whether its change is proportional to its strengths while these are small.
+        is_linear: Whether its change is proportional to its strengths up to typical ones.
     """
 
     effect: Effect
@@ -356,7 +356,7 @@ def _shapes(
 
 
 def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
-    """Returns whether an effect is visible only at a size, not in the slope at zero.
+    """Returns whether what an effect changes at a typical size does not follow from small ones.
 
     Example: a lag far below the sampling time changes no sample.
     """

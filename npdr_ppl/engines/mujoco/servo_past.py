@@ -54,7 +54,8 @@ def with_recorded_past(
             if actuator not in known:
                 continue
             error, values, own = present[actuator], tables.effects[place], states[number]
-            present[actuator] = effect.act(error, values, own)
+            middle = effect.next_memory(error, values, own, 0.5 * inputs.time_step)
+            present[actuator] = effect.act(error, values, middle)
             later = effect.next_memory(error, values, own, inputs.time_step)
             if own is not None and later is not None:
                 states[number] = torch.where(step < start, later, own)

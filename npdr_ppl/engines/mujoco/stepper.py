@@ -80,7 +80,12 @@ class MujocoStepper(EffectChain):
         self._has_accelerations = ACCELERATION_STAGE in stages
         self._applied = state_view(batch, "qfrc_applied") if self.forces.effects else None
         self._servos = ServoErrors(
-            simulator.model, servo_effects, self._ctrl, self._qpos, self._qvel
+            simulator.model,
+            servo_effects,
+            self._ctrl,
+            self._qpos,
+            self._qvel,
+            is_fourth=is_fourth,
         )
         # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None

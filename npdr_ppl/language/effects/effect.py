@@ -48,9 +48,8 @@ class Effect(ABC):
             force.
         strength: Names of the parameters that scale the effect from zero; the others set its
             shape, and their nominal values are those of a typical device. Empty for all.
-        is_smooth: Whether the slope of trajectories in the strengths at zero holds up to typical
-            strengths, too. If not, sensitivities use finite steps of the size that :meth:`probe`
-            gives.
+        is_smooth: Whether trajectories change in proportion to small strengths, up to typical
+            ones. If not, a search tries the sizes that :meth:`probe` gives.
         is_resonant: Whether the effect oscillates at a rate that its strength, a time constant,
             sets. The effect then does not simply grow with its strength, so a search tries many
             values.

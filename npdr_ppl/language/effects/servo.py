@@ -52,5 +52,15 @@ class ServoEffect(Effect):
         memory: Tensor | None,
         time_step: float,
     ) -> Tensor | None:
-        """Returns the effect's own state after ``time_step`` seconds with an error."""
+        """Returns the effect's own state after ``time_step`` seconds with an error.
+
+        It must be a law in continuous time, and leave ``memory`` unchanged: in each step of the
+        engine it is called twice from the same state, for half of the step and for all of it.
+
+        Args:
+            error: Mean of goal minus position during this time, ``(N,)``.
+            parameters: The effect's parameters by short name.
+            memory: The effect's own state before.
+            time_step: Duration in s.
+        """
         return memory

@@ -244,11 +244,11 @@ class ServoLaw:
         """Sets the own state as a rollout begins."""
 
     def act(self, error: float, mean: float, step: float) -> tuple[float, float]:
-        """Returns the error on which the servo acts, and its mean during the step.
+        """Returns the error on which the servo acts as a step begins, and its mean.
 
         Args:
             error: Goal minus position at the start of an engine step.
-            mean: The same in the middle of the step.
+            mean: Its mean during the step.
             step: Seconds per engine step.
         """
         raise NotImplementedError
@@ -261,7 +261,7 @@ class ServoDeadBand(ServoLaw):
     width: float
 
     def act(self, error: float, mean: float, step: float) -> tuple[float, float]:
-        """Returns the error on which the servo acts, and its mean during the step."""
+        """Returns the error on which the servo acts as a step begins, and its mean."""
         return error - clip(error, self.width), mean - clip(mean, self.width)
 
 
@@ -278,7 +278,7 @@ class IntegralAction(ServoLaw):
         self.integral = 0.0
 
     def act(self, error: float, mean: float, step: float) -> tuple[float, float]:
-        """Returns the error on which the servo acts, and its mean during the step."""
+        """Returns the error on which the servo acts as a step begins, and its mean."""
         middle = clip(self.integral + 0.5 * step * self.rate * error, self.limit)
         self.integral = clip(self.integral + step * self.rate * mean, self.limit)
         return error + middle, mean + middle

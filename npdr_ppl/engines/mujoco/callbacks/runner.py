@@ -121,6 +121,11 @@ class LawRunner:
         self.last, self.previous = true, self.last
         return values
 
+    @property
+    def is_fourth(self) -> bool:
+        """Whether the integrator is RK4."""
+        return bool(self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
+
     def _bend(self, name: str, true: Mapping[str, float], step: float, count: int) -> float:
         """Returns how a channel deviated from a straight line in the last step."""
         last, partner = self.last, self.partners.get(name)
@@ -133,8 +138,7 @@ class LawRunner:
             return 0.0
         # RK4 advances positions with a mean velocity; all other integrators use the velocity at
         # the end of an engine step.
-        is_fourth = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        lag = 0.0 if is_fourth else 0.5 / count
+        lag = 0.0 if self.is_fourth else 0.5 / count
         mean = last[name] + (0.5 + lag) * change
         return 6.0 * ((true[partner] - last[partner]) / step - mean)
 
@@ -170,9 +174,11 @@ class LawRunner:
             joint, step = model.actuator_trnid[i, 0], float(model.opt.timestep)
             position = float(data.qpos[model.jnt_qposadr[joint]])
             error = float(data.ctrl[i]) - position
-            mean = error - 0.5 * step * float(data.qvel[model.jnt_dofadr[joint]])
-            acted, means[i] = law.act(error, means.get(i, mean), step)
-            data.ctrl[i] = position + acted
+            mean = means.get(i, error - 0.5 * step * float(data.qvel[model.jnt_dofadr[joint]]))
+            acted, means[i] = law.act(error, mean, step)
+            # RK4 follows the error within the step; all other integrators hold the servo's force.
+            change = means[i] - mean if self.is_fourth else acted - error
+            data.ctrl[i] += change
         h, qpos, qvel, applied = model.opt.timestep, data.qpos, data.qvel, data.qfrc_applied
         middle = data.time + 0.5 * h
         joints = [Joint(float(qpos[q]), float(qvel[v]), middle, h) for _, q, v in self.forces]

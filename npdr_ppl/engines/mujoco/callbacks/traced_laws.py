@@ -277,7 +277,7 @@ def _servo(effect: ServoEffect) -> TracedLaw:
     lines += [
         "",
         "    def act(self, error: float, mean: float, step: float) -> tuple[float, float]:",
-        '        """Returns the error on which the servo acts, and its mean during the step."""',
+        '        """Returns the error on which the servo acts as a step begins, and its mean."""',
     ]
     later = effect.next_memory(mean, own, before, step)
     statements, texts = _statements(recorder, [*acted, *memory.leaves_of(later)], _OF_ERROR)
