@@ -159,7 +159,8 @@ def test_compare_writes_what_the_documentation_promises(monkeypatch, capsys, tmp
 def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path, recording):
     words = [
         "fit", "pendulum", "--data", recording, "--rounds", 2, "--simulations", 100,
-        "--segment-length", 25, "--embedding", "all/5", "--quiet", "--out",
+        "--segment-length", 25, "--embedding", "all/5", "--quiet", "--backend",
+        "snpe-c(members=2, epochs=20)", "--out",
     ]  # fmt: skip
     killed = tmp_path / "killed"
     command = [sys.executable, "-m", "npdr_ppl.cli", *map(str, words), str(killed)]

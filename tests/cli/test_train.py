@@ -16,6 +16,7 @@ from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.models.furuta import furuta
 from npdr_ppl.rollouts import Rollouts
 from tests.helpers.command_line import assert_prints_sentence, run
+from tests.helpers.small_loop import without_remedies
 
 RIG = """
 import dataclasses
@@ -74,7 +75,8 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
         "train", "furuta", "--target", "furuta-random-7", "--task", f"{rig}:short", "--out", out,
         "--rollouts", 2, "--no-decisions", *QUICK,
     ]  # fmt: skip
-    code, text, err = run(monkeypatch, capsys, *words, "--iterations", 1, "--animate")
+    with without_remedies():
+        code, text, err = run(monkeypatch, capsys, *words, "--iterations", 1, "--animate")
     assert code == 0, err
     assert "simulated return" in text and "decisions are only logged" in text
     assert "deploy: The policy succeeds in" in text
@@ -95,7 +97,8 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
         assert code == 2 and sentence in err and len(err.strip().splitlines()) == 1
     # More iterations continue it; figures are made anew.
     (out / "learning_curve.png").unlink()
-    code, text, _ = run(monkeypatch, capsys, *words, "--iterations", 2, "--json", "--quiet")
+    with without_remedies():
+        code, text, _ = run(monkeypatch, capsys, *words, "--iterations", 2, "--json", "--quiet")
     assert code == 0
     second = json.loads(text)
     assert second == json.loads((out / "train.json").read_text())

@@ -48,7 +48,7 @@ def brief(method):
 
 
 def little_trained(method):
-    """The same after a few epochs, for tests that compare what one training made."""
+    """The same after a few epochs, for tests for which it does not matter what was learned."""
     if hasattr(method, "epochs"):
         return dataclasses.replace(method, epochs=5)
     return method
@@ -161,6 +161,7 @@ def test_density_is_normalised_and_fits_its_samples(method):
 
 
 def test_log_prob_is_differentiable(brief):
+    brief = little_trained(brief)
     problem = make_problem()
     state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
     z = torch.zeros(3, 2, requires_grad=True)
@@ -189,6 +190,7 @@ def test_same_seed_same_result_also_after_resumption(brief, tmp_path):
 
 
 def test_initial_state_survives_writing(brief):
+    brief = little_trained(brief)
     problem = make_problem()
     tensors, values = brief.tensors(brief.init(problem))
     restored = brief.restore(problem, tensors, json.loads(json.dumps(values)))
@@ -269,6 +271,7 @@ def test_stays_finite_far_from_the_simulations(brief):
 
 
 def test_leaves_the_callers_random_stream_to_the_caller(brief):
+    brief = little_trained(brief)
     problem = make_problem()
     state, _ = run_round(brief, problem, brief.init(problem), 0, n=200)
     torch.manual_seed(0)
@@ -279,6 +282,7 @@ def test_leaves_the_callers_random_stream_to_the_caller(brief):
 
 
 def test_reports_progress(brief):
+    brief = little_trained(brief)
     problem, seen = make_problem(), []
     with seeded(0):
         z = torch.randn(200, 2)

@@ -70,7 +70,7 @@ def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
 def test_a_plan_that_does_not_suffice_says_what_wider_limits_would_give(surviving):
     known, limits = surviving
     channels = {n: replace(c, noise=30.0 * c.noise) for n, c in limits.channels.items()}
-    narrow = replace(limits, channels=channels)
+    narrow = replace(limits, channels=channels, duration=0.5 * limits.duration)
     found = plan_recording(known, narrow, rollouts=1, rounds=1, seed=1)
     assert found.outlook.planned.right < PLANNING.wanted
     wider = {one.limit: one.chance for one in found.outlook.wider}

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
+from npdr_ppl.engines.common import compilation
 from npdr_ppl.engines.common.compilation import has_compiler
 from npdr_ppl.errors import ModelError, ShapeError
 from npdr_ppl.models.cart_pole import CartPole
@@ -111,9 +112,10 @@ def test_a_device_gets_the_same_commands(policy):
 @pytest.mark.slow
 @pytest.mark.skipif(not has_compiler("cpu"), reason="there is no C++ compiler")
 @pytest.mark.parametrize("kind", ["playback", "radial basis, random", "neural"])
-def test_compiled_loop_agrees_with_the_eager_one(kind, request):
+def test_compiled_loop_agrees_with_the_eager_one(kind, request, monkeypatch):
     if kind != "playback":  # which compiles fast, and is tested at full length
         request.getfixturevalue("short_kernels")
+        monkeypatch.setattr(compilation, "_STEPS_PER_CALL", (1,))  # a second one doubles the time
     policies = some_policies(POLICIES[kind], 3, torch.float64)
     domains, states = some_domains(2, torch.float64), some_states(2, torch.float64)
     eager, fast = (

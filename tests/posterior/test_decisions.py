@@ -111,7 +111,7 @@ def test_hidden_dry_friction_asks_for_another_model(quick):
 def test_a_recording_that_is_too_short_for_the_model_check_does_not_blame_the_model(quick):
     _, result = fit(
         pendulum,
-        swinging(friction=0.15),
+        swinging(friction=0.15, steps=100),
         backend=quick,
         num_simulations=200,
         options=npdr.DataOptions(segment_length=None),

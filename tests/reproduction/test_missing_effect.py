@@ -4,12 +4,15 @@ The whole search takes minutes; `npdr reproduce missing-effect` is how the figur
 """
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
 from npdr_ppl.cli import show
 from npdr_ppl.discovery import DiscoveryOptions, discover
+from npdr_ppl.discovery.discovery_folder import FITS
+from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.display.plots.missing_effect_figures import write_missing_effect_figures
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.effects import CoulombFriction, InputDelay, SensorLowPass
@@ -28,7 +31,9 @@ pytestmark = pytest.mark.skipif(
 )
 
 FILTER = "arm_velocity,pole_velocity"
-OPTIONS = DataOptions(precision="float32")
+OPTIONS = DataOptions(precision="float32", segment_length=50)
+"""Half the default length: simulations of segments of half the steps take half the time."""
+
 SEARCH = DiscoveryOptions(
     effects=(SensorLowPass(FILTER), InputDelay("voltage"), CoulombFriction("arm")),
     max_effects=3,
@@ -43,11 +48,32 @@ def recordings():
     return load_recordings(RECORDINGS)
 
 
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory):
+    """A folder of finished fits: both searches begin with the same fits of the same recordings."""
+    return tmp_path_factory.mktemp("fits")
+
+
+@pytest.mark.slow
+def test_filter_and_delay_are_found_among_the_whole_catalogue(recordings, fits):
+    swing_ups, _ = recordings
+    search = DiscoveryOptions(max_effects=2)
+    with keep_fits(fits):
+        found = discover(furuta, swing_ups[[0, 1]], options=OPTIONS, search=search)
+    assert [f.effect.name for f in found.effects] == [
+        f"{FILTER}.sensor_low_pass",
+        "voltage.input_delay",
+    ]
+    assert found.effects[0].probability > 0.9
+    assert len(found.ranking) > 30
+
+
 @pytest.mark.slow
 def test_a_revised_model_with_filter_delay_and_friction_helps_on_another_excitation(
-    recordings, tmp_path, capsys
+    recordings, fits, tmp_path, capsys
 ):
     swing_ups, chirps = recordings
+    shutil.copytree(fits, tmp_path / FITS)
     part = swing_ups[[0, 1, 3, 4]]  # One to fit leaves flat directions to chance.
     story, result = reproduce_missing_effect(
         part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, search=SEARCH, progress=False
@@ -76,19 +102,6 @@ def test_a_revised_model_with_filter_delay_and_friction_helps_on_another_excitat
         part, chirps[[0]], tmp_path, holdout=(2, 3), options=OPTIONS, search=SEARCH, progress=False
     )
     assert again is None and read == json.loads((tmp_path / "missing-effect.json").read_text())
-
-
-@pytest.mark.slow
-def test_filter_and_delay_are_found_among_the_whole_catalogue(recordings):
-    swing_ups, _ = recordings
-    search = DiscoveryOptions(max_effects=2)
-    found = discover(furuta, swing_ups[[0, 1]], options=OPTIONS, search=search)
-    assert [f.effect.name for f in found.effects] == [
-        f"{FILTER}.sensor_low_pass",
-        "voltage.input_delay",
-    ]
-    assert found.effects[0].probability > 0.9
-    assert len(found.ranking) > 30
 
 
 def test_recordings_are_a_folder_or_the_file_of_swing_ups(recordings, tmp_path):

@@ -75,7 +75,8 @@ def test_no_law_is_learned_where_nothing_is_missing(quiet):
 def test_a_discovery_writes_the_learned_effect_and_a_model_that_has_it(tmp_path):
     case = make_case("pendulum", "outside", (("hinge", "cubic_damping"),), strength=3.0, seed=2001)
     search = npdr.DiscoveryOptions(effects=(), learn=True)
-    found = npdr.discover(case.model, case.fit, holdout=case.holdout, search=search)
+    fit, holdout = case.fit[[0, 1]], case.holdout[[0]]
+    found = npdr.discover(case.model, fit, holdout=holdout, search=search)
     assert found.verdict == "learned"
     assert found.gap["rmse"].after < found.gap["rmse"].before
     found.save(tmp_path)
@@ -83,9 +84,7 @@ def test_a_discovery_writes_the_learned_effect_and_a_model_that_has_it(tmp_path)
     exec((tmp_path / "learned_effect.py").read_text(), space)
     effect = space["LearnedHinge"]("hinge")
     revised = add_effect(case.model, effect)
-    before, after = (
-        fit_hypothesis(m, case.fit, short_segments(case.fit)) for m in (case.model, revised)
-    )
+    before, after = (fit_hypothesis(m, fit, short_segments(fit)) for m in (case.model, revised))
     assert float(after.fit.scale.log().sum()) < float(before.fit.scale.log().sum())
     assert "class LearnedHinge(ForceEffect):" in (tmp_path / "revised_model.py").read_text()
 
