@@ -1,6 +1,7 @@
 import gc
 import math
 import os
+from dataclasses import replace
 
 import pyro
 import pyro.distributions as dist
@@ -14,8 +15,9 @@ from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.posterior import estimator_check
+from npdr_ppl.preparation import importance_sampling
 from npdr_ppl.rollouts import Rollouts
-from tests.helpers.few_draws import few_draws as checked_with_few_draws
 
 NOISE = {"angle": 0.05, "velocity": 0.2}
 
@@ -62,10 +64,15 @@ def quick():
 
 
 @pytest.fixture
-def few_draws():
+def few_draws(monkeypatch):
     """Gives the check of a posterior too few draws to agree with the simulator."""
-    with checked_with_few_draws():
-        yield
+    few = replace(
+        importance_sampling.IMPORTANCE_SAMPLING,
+        most_iterations=1, draws_per_iteration=8, draws_of_given=8,
+    )  # fmt: skip
+    monkeypatch.setattr(importance_sampling, "IMPORTANCE_SAMPLING", few)
+    fewer = replace(estimator_check.ESTIMATOR_CHECK, num_draws=16)
+    monkeypatch.setattr(estimator_check, "ESTIMATOR_CHECK", fewer)
 
 
 @pytest.fixture

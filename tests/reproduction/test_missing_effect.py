@@ -31,9 +31,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 FILTER = "arm_velocity,pole_velocity"
-OPTIONS = DataOptions(precision="float32", segment_length=50)
-"""Half the default length: simulations of segments of half the steps take half the time."""
-
+OPTIONS = DataOptions(precision="float32")
 SEARCH = DiscoveryOptions(
     effects=(SensorLowPass(FILTER), InputDelay("voltage"), CoulombFriction("arm")),
     max_effects=3,
