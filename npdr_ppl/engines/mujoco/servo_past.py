@@ -25,9 +25,8 @@ def with_recorded_past(
 
     The first effect of a servo gets its error in every step since the rollout began: the recorded
     goal minus the mean of the measured positions before and after the step. A later effect gets
-    the error that the one before it gives.
-    Without a record, or if the joint's position was not measured, states stay those of a rollout's
-    beginning.
+    the error that the one before it gives. Without a record, or if the joint's position was not
+    measured, states stay those of a rollout's beginning.
 
     Args:
         simulator: The simulator with its effects.
