@@ -359,7 +359,7 @@ def test_a_filtered_servo_has_no_dead_band():
 
 
 def test_integral_action_is_tried_at_typical_rates():
-    (given,) = {IntegralAction("goal").probe(joint().port("goal"))["rate"]}
+    given = IntegralAction("goal").probe(joint().port("goal"))["rate"]
     tried = _probe(IntegralAction("goal"), goals(np.zeros(10)), joint(), None)
     assert {run["rate"] for run in tried.runs} == {size * given for size in SENSITIVITY.sizes}
 

@@ -356,7 +356,7 @@ def _shapes(
 
 
 def _needs_size(effect: Effect, strengths: tuple[str, ...]) -> bool:
-    """Returns whether what an effect changes at a typical size does not follow from small ones.
+    """Returns whether small sizes of an effect do not tell what a typical size changes.
 
     Example: a lag far below the sampling time changes no sample.
     """

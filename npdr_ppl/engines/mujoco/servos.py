@@ -91,9 +91,10 @@ class ServoErrors:
 
     The servos act on a joint directly, with a gear of one. The engine holds a goal during a step.
     So an effect acts with its state in the middle of the step, and its next state follows from the
-    error there, e − ½ h v. With ``RK4``, whose servo follows the motion within a step, the error
-    changes by what it does there, too, so that the result is right to second order. The other
-    integrators are of first order themselves and take the change at the start, which damps more.
+    error there, e − ½ h v. ``RK4`` computes the servo's force several times within a step; its goal
+    is shifted by what the effect changes at the error in the middle, so that the result is right to
+    second order. All other integrators are of first order: their goal is shifted by the change at
+    the error as the step begins, which damps more.
 
     Args:
         model: A ``mujoco.MjModel``.
