@@ -90,11 +90,11 @@ class ServoErrors:
     """Changes the goals of position servos so that they act on the errors that effects give.
 
     The servos act on a joint directly, with a gear of one. The engine holds a goal during a step.
-    So an effect acts with its state in the middle of the step, and its next state follows from the
-    error there, e − ½ h v. ``RK4`` computes the servo's force several times within a step; its goal
-    is shifted by what the effect changes at the error in the middle, so that the result is right to
-    second order. All other integrators are of first order: their goal is shifted by the change at
-    the error as the step begins, which damps more.
+    So an effect acts with its state in the middle of the step, and its next state follows from
+    the error there, e − ½ h v. ``RK4`` computes the servo's force several times within a step;
+    its goal is shifted by what the effect changes at the error in the middle, so that the result
+    is right to second order. All other integrators are of first order: their goal is shifted by
+    the change at the error as the step begins, which damps more.
 
     Args:
         model: A ``mujoco.MjModel``.
