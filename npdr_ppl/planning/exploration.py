@@ -25,21 +25,18 @@ class Explored:
         found: The course of the search.
         played: The best candidates, then random ones.
         num_pool: Number of the best ones.
+        every: Index of each candidate that a plan may use, without those that come twice.
     """
 
     judge: Judge
     found: Found
     played: Played
     num_pool: int
-
-    @property
-    def every(self) -> Sequence[int]:
-        """All candidates, of which a plan may use each."""
-        return range(len(self.played.commands))
+    every: Sequence[int]
 
     def random(self, number: int) -> list[int]:
         """Returns a number of random candidates, in turn if there are fewer."""
-        members = self.every[self.num_pool :]
+        members = range(self.num_pool, len(self.played.commands))
         return [members[k % len(members)] for k in range(number)]
 
 
@@ -84,7 +81,12 @@ def explore(
     most = num_candidates or judge.most_shown
     pool, random = found.pool[:most], found.random[:most]
     played = played_by(excitations, judge, [*pool, *random])
-    return Explored(judge, found, played, len(pool))
+    others = [
+        number
+        for number, candidate in enumerate(random, len(pool))
+        if not any(candidate is better for better in pool)
+    ]
+    return Explored(judge, found, played, len(pool), [*range(len(pool)), *others])
 
 
 def _nothing_found(known: Known, judge: Judge, found: Found) -> DataError:

@@ -265,7 +265,26 @@ class Judge:
         both = torch.cat((now.by_parameters, now.residual[..., None]), dim=-1)
         joined = replace(now, by_parameters=both)
         products = joined.by_parameters.mT @ joined.weights()
-        return products.unflatten(0, (len(played.commands), -1))
+        products = products.unflatten(0, (len(played.commands), -1))
+        return self._trust(played, a)[:, None, None, None] * products
+
+    def _trust(self, played: Played, cause: int) -> Tensor:
+        """Returns the weights of candidates, less than 1 for tiny motions, ``(E,)``.
+
+        Models are fitted to larger motions. Near standstill the robot's friction is another one.
+        """
+        ranges = (self.known.recorded or {}).get("channels", {})
+        reach = np.ptp(self._paths(played)[cause], axis=1)
+        shares = [
+            reach[:, k] / max(min(ranges[name]["max"] - ranges[name]["min"], limit), 1e-300)
+            for k, (name, channel) in enumerate(self.limits.channels.items())
+            if name in ranges
+            for limit in (channel.max - channel.min,)
+        ]
+        if not shares:
+            return torch.ones(len(reach), dtype=torch.float64)
+        moves = np.max(shares, axis=0) / PLANNING.least_motion
+        return torch.tensor(np.minimum(1.0, moves) ** 2)
 
     def _segments(self, cause: Cause, played: Played, a: int, every: int) -> SegmentModel:
         """Returns a cause along segments of what cause a simulates."""

@@ -33,6 +33,9 @@ class PlanningSettings:
             about the middle of the range. About itself, it could not move if it is at the limit,
             as the goal of a servo that starts at its end stop.
         margin: Share of a limit that simulations keep free, because the robot is not the model.
+        least_motion: Motion, as a share of the recorded one, below which predictions are trusted
+            less. Plans that moved a pendulum by 1 to 7 % of what it may were predicted to tell its
+            frictions apart and did not (``benchmarks/planning.py``, seeds 2173 and 2174).
         num_draws: Number of prior draws over which information is averaged.
         num_smoothed: Number of noisy simulated recordings from which the errors of initial states
             are estimated.
@@ -68,6 +71,7 @@ class PlanningSettings:
     amplitudes: tuple[float, ...] = (1.0, 0.7, 0.45, 0.25, 0.1)
     least_room: float = 0.25
     margin: float = 0.05
+    least_motion: float = 0.25
     num_draws: int = 5
     num_smoothed: int = 3
     relative_noise: float = 1e-3
@@ -92,7 +96,7 @@ class PlanningSettings:
         check_range(self, 10, 10_000, "num_datasets", "num_resamplings")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")
-        check_range(self, 0.0, 1.0, "wanted", "least_likely", "search_share")
+        check_range(self, 0.0, 1.0, "wanted", "least_likely", "search_share", "least_motion")
         check_range(self, 0.0, 0.5, "least_room")
         check_range(self, 0.0, 1.0, "relative_noise")
         check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")

@@ -84,6 +84,23 @@ def test_a_simple_law_is_fitted_again_where_one_that_contains_it_fits_better(rub
     assert with_simple_forms(dry, asked, None, lambda: True) is asked
 
 
+def test_a_law_whose_shape_is_not_told_counts_for_the_simple_law_in_it(rubbed):
+    searcher, base = rubbed
+    dry, drift, viscous = (
+        CoulombFriction("hinge"),
+        FrictionDrift("hinge"),
+        ViscousFriction("hinge"),
+    )
+    models = {law.name: fitted(searcher, law) for law in (dry, drift, viscous)}
+    with_dry = models.pop(dry.name)
+    found = Alternatives(base, with_dry, models)
+    _, added = weigh_alternatives(base, with_dry, dry, found)
+    assert added.effect.name == dry.name and added.forms == (drift.name,)
+    both = added.alternatives[dry.name] + added.alternatives[drift.name]
+    assert added.probability == pytest.approx(both)
+    assert added.probability > added.alternatives[dry.name]
+
+
 @pytest.mark.parametrize("law", [PreslidingFriction, StribeckFriction, FrictionDrift])
 def test_a_law_whose_shape_explains_nothing_takes_its_simplest_form(rubbed, law):
     searcher, base = rubbed

@@ -12,7 +12,8 @@ from npdr_ppl.planning.limits import default_limits, read_limits
 def ambiguous(tmp_path_factory):
     """A case with weak dry friction, and the folder of its discovery from one rollout."""
     case = make_case("pendulum", "one", (("hinge", "coulomb_friction"),), strength=0.1, seed=3)
-    found = npdr.discover(case.model, case.fit[[0]])
+    search = npdr.DiscoveryOptions(confidence=0.99)
+    found = npdr.discover(case.model, case.fit[[0]], search=search)
     assert found.verdict == "ambiguous"
     folder = tmp_path_factory.mktemp("discovery")
     found.save(folder)

@@ -10,6 +10,7 @@ from npdr_ppl.planning.causes import Known
 from npdr_ppl.planning.excitations import Excitations
 from npdr_ppl.planning.judging import Judge, information_gain
 from npdr_ppl.planning.limits import ChannelLimits
+from npdr_ppl.planning.settings import PLANNING
 
 
 def candidates(limits, number=4):
@@ -161,3 +162,22 @@ def test_a_limit_that_the_motion_exceeds_is_a_violation(name, unrecorded):
         narrow = replace(limits, channels=limits.channels | {"angle": channel})
         violation = Judge(known, narrow, seed=0).violation(played)
         assert (violation[0] <= 0.0) == is_kept
+
+
+@pytest.mark.slow
+def test_what_a_tiny_motion_shows_counts_less(surviving):
+    known, limits = surviving
+    judge = Judge(known, limits, seed=0)
+    commands, _ = candidates(limits, 1)
+    rest = np.zeros((2, len(limits.channels)))
+    played = judge.played(np.concatenate((commands, 1e-3 * commands)), rest)
+    channels = known.recorded["channels"]
+    reach = np.ptp(played.readings[0], axis=1)
+    recorded = [channels[name]["max"] - channels[name]["min"] for name in limits.channels]
+    large, tiny = (reach / recorded).max(axis=1)
+    assert large > PLANNING.least_motion > tiny
+    trusted = judge.information(played, 0)
+    everything = Judge(replace(known, recorded=None), limits, seed=0).information(played, 0)
+    torch.testing.assert_close(trusted[0], everything[0])
+    share = (tiny / PLANNING.least_motion) ** 2
+    torch.testing.assert_close(trusted[1], share * everything[1], rtol=0.01, atol=1e-6)

@@ -57,6 +57,7 @@ class Added:
         fitting: Names of the alternatives that fit equally well. The simplest law is the
             likeliest. But a law that contains it, as bristles contain dry friction, fits equally
             well if its further parameters have no visible influence.
+        forms: Names of those of them that contain it. The recording does not tell their shape.
         is_compared: Whether it was compared with alternatives; after a time limit it may not be.
     """
 
@@ -65,12 +66,13 @@ class Added:
     share: float
     alternatives: dict[str, float]
     fitting: tuple[str, ...] = ()
+    forms: tuple[str, ...] = ()
     is_compared: bool = True
 
     @property
     def probability(self) -> float:
-        """Probability of the effect, given all others."""
-        return self.alternatives[self.effect.name]
+        """Probability of the effect, alone or within a law that contains it, given all others."""
+        return sum(self.alternatives[name] for name in (self.effect.name, *self.forms))
 
 
 @dataclass(frozen=True)
@@ -247,9 +249,10 @@ def weigh_alternatives(
     whole, lost = (float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without))
     share = max(0.0, lost) / max(whole, 1e-12)
     fitting = _fitting(trials, best)
+    forms = tuple(name for name in fitting if _contains(trials[name], name, chosen))
     if best == effect.name and not alternatives.is_better:
         swapped = current
-    return swapped, Added(chosen, effect.name, share, weights, fitting)
+    return swapped, Added(chosen, effect.name, share, weights, fitting, forms)
 
 
 def _linear_share(base: Hypothesis, current: Hypothesis, effect: Effect) -> float:
@@ -310,6 +313,12 @@ def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
         and reference.share * float(trial.losses(reference.fit.scale).sum() - least)
         < EVIDENCE.indistinct_loss
     )
+
+
+def _contains(trial: Hypothesis, name: str, law: Effect) -> bool:
+    """Returns whether an effect of a model, by its name, contains a law."""
+    effect = next(effect for effect in trial.effects if effect.name == name)
+    return effect.port == law.port and law.id in effect.contains
 
 
 def _strains(

@@ -74,7 +74,7 @@ def with_rivals(
                 found = replace(found, is_compared=False)
                 report(f"{effect.name}: not compared with alternatives")
             else:
-                report(f"{effect.name}: probability {found.alternatives[effect.name]:.2f}")
+                report(f"{effect.name}: probability {found.probability:.2f}")
             added.append(found)
             # Only models with the same initial states can be compared.
             models = {effect.name: asked}
