@@ -71,6 +71,8 @@ class Port:
         coordinate: Unit of the position of a joint that a force or a servo acts on: ``"rad"`` for
             a revolute, ``"m"`` for a prismatic joint.
         rated_force: Typical force of a servo, in :attr:`force_unit`.
+        joint: Name of the port of the force at the joint that a servo moves; empty if there is
+            none.
         is_driven: Whether an actuator drives the joint that a force acts on.
     """
 
@@ -83,6 +85,7 @@ class Port:
     coordinate: str = "rad"
     is_driven: bool = True
     rated_force: float = 1.0
+    joint: str = ""
 
     @property
     def follows_position(self) -> bool:

@@ -34,12 +34,17 @@ __all__ = [
     "ripple_laws",
     "strongest_frequency",
     "strongest_ripple",
+    "strongest_rounding",
     "wave_laws",
 ]
 
 
 PER_TURN = range(GENERIC_LAWS.fewest_per_turn, GENERIC_LAWS.most_per_turn + 1)
 """Numbers of ripples per turn that are tried at the joint itself."""
+
+
+_TOGETHER = 64
+"""Number of roundings that are tried together, whose products are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -318,6 +323,60 @@ def strongest_ripple(projection: Projection, found: Responses, port: str) -> int
         return None
     waves = torch.cat([_ripple(x, number) for number in PER_TURN], dim=-1)
     return PER_TURN[_strongest(projection, found, port, waves)]
+
+
+def strongest_rounding(
+    projection: Projection, found: Responses, command: str, port: str, largest: float
+) -> float:
+    """Returns the step that explains most if a command is rounded to its multiples.
+
+    The error of the rounded command acts as a force at the joint of its servo. Two steps round
+    the greatest command u alike if its numbers of steps, u/Δ, differ by much less than one. So
+    these differ by a quarter between steps that are tried. But wherever u/Δ is close to a half, a
+    little other step rounds to the next number, so that the misfit has local minima. Therefore
+    many steps about the strongest are tried, too.
+
+    Args:
+        projection: The fitted model.
+        found: The responses to pulses.
+        command: The command.
+        port: The port of the force at the joint.
+        largest: The largest step.
+    """
+    u = found.channels[command]
+    pulses = PulseChanges(projection, found.by_port[port])
+
+    def strongest(numbers: Tensor, errors: Callable[[Tensor], Tensor]) -> float:
+        """Returns that of some numbers of steps per unit, ``(n,)``."""
+        gains = []
+        for part in numbers.split(_TOGETHER):
+            scores = pulses.scores(errors(part))
+            # Parameters can imitate the error of a command that never moves.
+            is_told = scores.absorbed < 1.0 - 1e-6
+            # The force has the sign of the error.
+            gain = scores.score.clamp_min(0.0).square() / scores.information.diagonal()
+            gains.append(torch.where(is_told, gain, 0.0))
+        return float(numbers[torch.cat(gains).argmax()])
+
+    spacing = 0.25 / max(float(u.abs().max()), largest)
+    more = spacing * torch.arange(GENERIC_LAWS.num_roundings, dtype=torch.float64)
+    first = strongest(1.0 / largest + more, partial(_errors_of_rounding, u))
+    about = torch.linspace(-1.0, 1.0, GENERIC_LAWS.num_finer_roundings, dtype=torch.float64)
+
+    def mean_errors(numbers: Tensor) -> Tensor:
+        return found.mean_over_pulses(_errors_of_rounding(found.commands[command], numbers))
+
+    return 1.0 / strongest(first + spacing * about, mean_errors)
+
+
+def _errors_of_rounding(commands: Tensor, numbers: Tensor) -> Tensor:
+    """Returns the errors of commands, ``(S, K)``, rounded to steps, ``(S, K, n)``.
+
+    Args:
+        commands: The commands.
+        numbers: Numbers of steps per unit, ``(n,)``.
+    """
+    return (commands[..., None] * numbers).round() / numbers - commands[..., None]
 
 
 def _strongest(projection: Projection, found: Responses, port: str, waves: Tensor) -> int:

@@ -232,6 +232,8 @@ def _probe(
     cases = [
         ({**probe, **shape}, is_hinted, size)
         for (shape, is_hinted), size in itertools.product(shapes, sizes)
+        # A part of the strongest step rounds differently.
+        if not (is_hinted and effect.rounds) or size == 1.0
     ]
     nominal = [
         torch.tensor([_resting(resting[n], values[n]) for n in strengths]).double()
@@ -310,6 +312,8 @@ def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
         lower, upper, deviation = _limits(probe.priors, strengths, nominal, full)
         if probe.effect.is_resonant:
             lower, upper = lower.clamp_min(low), upper.clamp_max(high)
+        elif probe.effect.rounds and is_hinted:
+            lower, upper = torch.ones_like(lower), torch.ones_like(upper)
         change = difference.permute(1, 2, 0)
         result.append(
             Variant(

@@ -4,15 +4,22 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
+import torch
+
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.equivalents import irreducible
-from npdr_ppl.discovery.screening.generic_laws import strongest_frequency, strongest_ripple
+from npdr_ppl.discovery.screening.generic_laws import (
+    strongest_frequency,
+    strongest_ripple,
+    strongest_rounding,
+)
 from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.sensitivities import Variant, sensitivities
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.reference import quantile
 from npdr_ppl.models.effects import candidate_effects
 
 __all__ = ["candidates_at", "variants_of"]
@@ -69,7 +76,7 @@ def variants_of(
 ) -> Iterator[Variant]:
     """Yields the candidates in all shapes and sizes, waves also at the strongest frequency.
 
-    Ripples have the strongest number per turn.
+    Ripples have the strongest number per turn, and roundings also the strongest step.
 
     Args:
         candidates: The effects.
@@ -83,6 +90,12 @@ def variants_of(
         for effect in candidates
         if effect.wave and effect.port in found.by_port
     }
+    for effect in candidates:
+        port = hypothesis.simulator.port(effect.port)
+        if effect.rounds and port.joint in found.by_port:
+            largest = float(quantile(effect.priors(port)[effect.rounds], torch.tensor(0.999)))
+            step = strongest_rounding(projection, found, port.name, port.joint, largest)
+            hints[effect.name] = {effect.rounds: step}
     candidates, numbered = _with_ripples(candidates, projection, found)
     for variant in _in_all_shapes(hypothesis, candidates, hints, number):
         yield replace(variant, is_hinted=True) if variant.effect.name in numbered else variant

@@ -293,11 +293,19 @@ def _is_found_again(trial: Hypothesis, name: str) -> bool:
 
 
 def log_prior(hypothesis: Hypothesis) -> float:
-    """Returns the penalty for searching frequencies: all of them share one hypothesis's prior."""
+    """Returns the penalty for searching frequencies: all of them share one hypothesis's prior.
+
+    The same holds for numbers of ripples, and for steps of commands.
+    """
     tried = [
-        GENERIC_LAWS.num_frequencies if effect.wave else len(PER_TURN)
+        number
         for effect in hypothesis.effects
-        if effect.wave or effect.has_ripples
+        for is_searched, number in (
+            (effect.wave, GENERIC_LAWS.num_frequencies),
+            (effect.has_ripples, len(PER_TURN)),
+            (effect.rounds, GENERIC_LAWS.num_roundings),
+        )
+        if is_searched
     ]
     return -sum(map(math.log, tried))
 

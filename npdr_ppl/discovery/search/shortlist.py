@@ -252,7 +252,9 @@ def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
     """
     variant, effect = candidate.variant, candidate.variant.effect
     guesses = [variant.parameters(candidate.sizes)]
-    if not (variant.is_linear or effect.is_resonant or effect.has_local_minima):
+    if not (
+        variant.is_linear or effect.is_resonant or effect.has_local_minima or variant.is_hinted
+    ):
         guesses.append(variant.parameters(torch.ones_like(candidate.sizes)))
     return guesses
 

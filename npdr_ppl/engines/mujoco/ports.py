@@ -140,6 +140,7 @@ def _command_port(
             rated_speed=joint.rated_speed,
             rated_position=joint.rated_position,
             coordinate=joint.coordinate,
+            joint=joint.name,
             rated_force=max(joint.rated / gear, gain * _LARGE_ERROR * gear * joint.rated_position),
         )
     return port
