@@ -22,7 +22,7 @@ class Joint(ODESimulator):
     )
     joints = ("joint",)
     ports = (
-        Port("goal", "servo", "rad"),
+        Port("goal", "servo", "rad", joint="joint"),
         Port("joint", "force", "N m", rated_speed=0.5),
         Port("angle", "sensor", "rad"),
         Port("velocity", "sensor", "rad/s", rated=0.5),

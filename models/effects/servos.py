@@ -253,13 +253,12 @@ class GoalResolution(_GoalEffect):
 
     id = "goal_resolution"
     parameters = (Parameter("step", "{port}", 0.0, "step Δ"),)
-    is_smooth = False
     rounds = "step"
     law = "Δ round(u/Δ)"
     excitation = "slow_ramp"
 
     def default_priors(self, port: Port) -> dict[str, Distribution]:
-        """Uniform; up to 2 % of the rated excursion. 8 bits per turn are steps of 0.025 rad."""
+        """Uniform; up to 2 % of the rated excursion: 9 bits per turn are 0.012 rad."""
         return {"step": dist.Uniform(0.0, 0.02 * port.rated_position)}
 
     def act(

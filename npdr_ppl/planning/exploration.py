@@ -25,7 +25,8 @@ class Explored:
         found: The course of the search.
         played: The best candidates, then random ones.
         num_pool: Number of the best ones.
-        every: Index of each candidate that a plan may use, without those that come twice.
+        every: Indices of the candidates that a plan may use. Random ones that are also among the
+            best are in it once.
     """
 
     judge: Judge

@@ -39,6 +39,10 @@ __all__ = ["Judge", "Played", "Shown", "information_gain"]
 Array = NDArray[np.float64]
 
 
+_RANGE_OF_NOISE = 10.0
+"""Standard deviations between the greatest and the least of a million measurements at rest."""
+
+
 @dataclass(frozen=True)
 class Played:
     """Candidates and what every cause simulates.
@@ -271,7 +275,7 @@ class Judge:
     def _trust(self, played: Played, cause: int) -> Tensor:
         """Returns the weights of candidates, less than 1 for tiny motions, ``(E,)``.
 
-        Models are fitted to larger motions. Near standstill the robot's friction is another one.
+        Models are fitted to larger motions. Near standstill, friction differs from its models.
         """
         ranges = (self.known.recorded or {}).get("channels", {})
         reach = np.ptp(self._paths(played)[cause], axis=1)
@@ -280,6 +284,8 @@ class Judge:
             for k, (name, channel) in enumerate(self.limits.channels.items())
             if name in ranges
             for limit in (channel.max - channel.min,)
+            # A joint that rested tells nothing about large motions.
+            if ranges[name]["max"] - ranges[name]["min"] > _RANGE_OF_NOISE * channel.noise
         ]
         if not shares:
             return torch.ones(len(reach), dtype=torch.float64)

@@ -33,9 +33,10 @@ class PlanningSettings:
             about the middle of the range. About itself, it could not move if it is at the limit,
             as the goal of a servo that starts at its end stop.
         margin: Share of a limit that simulations keep free, because the robot is not the model.
-        least_motion: Motion, as a share of the recorded one, below which predictions are trusted
-            less. Plans that moved a pendulum by 1 to 7 % of what it may were predicted to tell its
-            frictions apart and did not (``benchmarks/planning.py``, seeds 2173 and 2174).
+        least_motion: Motion, as a share of the recorded one or of what the limits permit, below
+            which squared separations shrink with its square. Plans that moved a pendulum by 1 to
+            7 % of what it may were predicted to tell its frictions apart and did not
+            (``benchmarks/planning.py``, seeds 2173 and 2174).
         num_draws: Number of prior draws over which information is averaged.
         num_smoothed: Number of noisy simulated recordings from which the errors of initial states
             are estimated.

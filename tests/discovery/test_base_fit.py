@@ -14,7 +14,7 @@ def test_steps_are_refined_until_parameters_do_not_compensate_for_them():
     searcher = Searcher(pendulum, recording, npdr.DiscoveryOptions())
     found = searcher.with_finer_steps(searcher.fit_base())
     finest = pendulum
-    for _ in range(2):
+    for _ in range(3):
         finest = npdr.with_finer_steps(finest)
     best = Searcher(finest, recording, npdr.DiscoveryOptions()).fit_base()
     assert best.simulator.with_finer_steps() is None

@@ -156,17 +156,17 @@ def test_an_inseparable_pair_is_reported_as_a_class():
 def test_a_law_that_contains_another_is_named_where_it_shows_and_else_reported():
     few = CoulombFriction("hinge"), PreslidingFriction("hinge"), ViscousFriction("hinge")
 
-    def name(hidden):
+    def name(hidden, strength):
         place = ("hinge", hidden)
-        _, found = discover("pendulum", "one", (place,), strength=0.3, effects=few)
+        _, found = discover("pendulum", "one", (place,), strength=strength, effects=few)
         (finding,) = found.effects
         return finding
 
-    dry = name("coulomb_friction")
+    dry = name("coulomb_friction", 0.2)
     assert dry.effect.id == "coulomb_friction"
     assert dry.probability > 0.9
     assert "presliding_friction" in dry.equivalent_to
-    bent = name("presliding_friction")
+    bent = name("presliding_friction", 0.3)
     assert bent.effect.id == "presliding_friction"
     assert "coulomb_friction" not in bent.equivalent_to
 

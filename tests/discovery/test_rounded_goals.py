@@ -1,13 +1,16 @@
 """Goals that a servo rounds: the step is found from the recording."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import servo_law_rigs
+import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.cli.resolve import resolve_model
 from npdr_ppl.discovery.screening.generic_laws import strongest_rounding
+from npdr_ppl.discovery.screening.groups import ranked_laws
 from npdr_ppl.discovery.screening.latent_force import responses
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import screen
@@ -46,7 +49,9 @@ def test_only_the_whole_step_is_screened_and_comes_first(rounded):
     hinted = [variant for variant in every if variant.is_hinted]
     assert [variant.effect.id for variant in hinted] == ["goal_resolution"]
     best = screen(projection, every)[0]
-    assert best.name == "servo.goal_resolution" and best.sizes.tolist() == [1.0]
+    assert best.name == "servo.goal_resolution" and best.sizes.tolist() == pytest.approx(
+        [1.0], abs=1e-5
+    )
     assert best.variant.values["step"] == pytest.approx(case.values["step"], rel=5e-4)
 
 
@@ -62,3 +67,26 @@ def test_a_fit_that_begins_there_finds_the_step(rounded):
     assert step == pytest.approx(case.values["step"], rel=1e-3)
     # One of many steps explains something by chance.
     assert log_prior(found) == log_prior(base) - math.log(GENERIC_LAWS.num_roundings)
+
+
+def test_a_constant_command_has_no_step(rounded):
+    _, _, base = rounded
+    found = responses(base)
+    held = torch.full_like(found.channels["servo"], 0.3)
+    still = replace(found, channels={**found.channels, "servo": held})
+    assert strongest_rounding(Projection(base), still, "servo", "hinge_torque", 0.02) is None
+
+
+@pytest.mark.slow
+def test_the_same_law_at_three_servos_is_weighed_with_found_steps(rounded):
+    _, searcher, base = rounded
+    projection = Projection(base)
+    best = screen(projection, variants_of(searcher.options.effects, projection, responses(base)))[
+        0
+    ]
+    three = [
+        replace(best, variant=replace(best.variant, effect=GoalResolution(f"servo_{k}")))
+        for k in range(3)
+    ]
+    groups = ranked_laws(projection, three)
+    assert all(len(group.members) >= 2 for group in groups)

@@ -141,10 +141,13 @@ def test_finer_steps_are_taken_where_there_are_some(inputs):
     expected = Pendulum(integrator="midpoint").simulate(fixed, inputs)
     assert torch.equal(reading(finer), expected)
     assert not torch.equal(reading(pendulum), expected)
-    # Twice as well, and then nothing is finer; effects stay attached, and come off.
+    # Twice as well, then with twice as many steps; effects stay attached, and come off.
     finest = Pendulum(integrator="rk4").simulate(fixed, inputs)
     assert torch.equal(reading(npdr.with_finer_steps(finer)), finest)
-    assert Pendulum(integrator="rk4").with_finer_steps() is None
+    twice = Pendulum(integrator="rk4", substeps=2).simulate(fixed, inputs)
+    most = npdr.with_finer_steps(npdr.with_finer_steps(finer))
+    assert torch.equal(reading(most), twice)
+    assert torch.equal(reading(npdr.with_finer_steps(most)), twice)
     revised = npdr.with_finer_steps(npdr.add_effect(pendulum, Bias("hinge")))
     assert sites(revised, inputs) == ["mass", "length", "hinge.bias.offset", "trajectory"]
     bare = npdr.remove_effect(revised, "hinge.bias")

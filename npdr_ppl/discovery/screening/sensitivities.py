@@ -28,6 +28,10 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 __all__ = ["Variant", "sensitivities"]
 
 
+_ROUNDING_ROOM = 1e-6
+"""Relative change of a step that no command notices. Solvers need some room between bounds."""
+
+
 @dataclass(frozen=True)
 class Variant:
     """An effect with one shape, switched on at one size.
@@ -231,9 +235,9 @@ def _probe(
         shapes, sizes = _limit_shapes(shapes[0][0], limits, priors), (1.0,)
     cases = [
         ({**probe, **shape}, is_hinted, size)
-        for (shape, is_hinted), size in itertools.product(shapes, sizes)
-        # A part of the strongest step rounds differently.
-        if not (is_hinted and effect.rounds) or size == 1.0
+        for shape, is_hinted in shapes
+        # Only the whole step is tried: half of it rounds to other values.
+        for size in ((1.0,) if is_hinted and effect.rounds else sizes)
     ]
     nominal = [
         torch.tensor([_resting(resting[n], values[n]) for n in strengths]).double()
@@ -313,7 +317,8 @@ def _variants(probe: _Probe, rows: Tensor, rounding: float) -> list[Variant]:
         if probe.effect.is_resonant:
             lower, upper = lower.clamp_min(low), upper.clamp_max(high)
         elif probe.effect.rounds and is_hinted:
-            lower, upper = torch.ones_like(lower), torch.ones_like(upper)
+            whole = strengths.index(probe.effect.rounds)
+            lower[whole], upper[whole] = 1.0 - _ROUNDING_ROOM, 1.0 + _ROUNDING_ROOM
         change = difference.permute(1, 2, 0)
         result.append(
             Variant(

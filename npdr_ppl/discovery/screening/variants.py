@@ -95,7 +95,8 @@ def variants_of(
         if effect.rounds and port.joint in found.by_port:
             largest = float(quantile(effect.priors(port)[effect.rounds], torch.tensor(0.999)))
             step = strongest_rounding(projection, found, port.name, port.joint, largest)
-            hints[effect.name] = {effect.rounds: step}
+            if step is not None:
+                hints[effect.name] = {effect.rounds: step}
     candidates, numbered = _with_ripples(candidates, projection, found)
     for variant in _in_all_shapes(hypothesis, candidates, hints, number):
         yield replace(variant, is_hinted=True) if variant.effect.name in numbered else variant

@@ -57,7 +57,8 @@ class Added:
         fitting: Names of the alternatives that fit equally well. The simplest law is the
             likeliest. But a law that contains it, as bristles contain dry friction, fits equally
             well if its further parameters have no visible influence.
-        forms: Names of those of them that contain it. The recording does not tell their shape.
+        forms: Names of those of them that contain it and fit no better. The recording does not
+            tell their shape.
         is_compared: Whether it was compared with alternatives; after a time limit it may not be.
     """
 
@@ -248,8 +249,13 @@ def weigh_alternatives(
     scale = closest([base, swapped]).fit.scale
     whole, lost = (float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without))
     share = max(0.0, lost) / max(whole, 1e-12)
-    fitting = _fitting(trials, best)
-    forms = tuple(name for name in fitting if _contains(trials[name], name, chosen))
+    excess = _excess_losses(trials, best)
+    fitting = tuple(name for name, e in excess.items() if e < EVIDENCE.indistinct_loss)
+    forms = tuple(
+        name
+        for name in fitting
+        if _contains(trials[name], name, chosen) and excess[name] > -EVIDENCE.indistinct_loss
+    )
     if best == effect.name and not alternatives.is_better:
         swapped = current
     return swapped, Added(chosen, effect.name, share, weights, fitting, forms)
@@ -310,17 +316,15 @@ def log_prior(hypothesis: Hypothesis) -> float:
     return -sum(map(math.log, tried))
 
 
-def _fitting(trials: Mapping[str, Hypothesis], best: str) -> tuple[str, ...]:
-    """Returns the names of alternatives that do not fit clearly worse than the likeliest."""
+def _excess_losses(trials: Mapping[str, Hypothesis], best: str) -> dict[str, float]:
+    """Returns by how many nats alternatives fit worse than the likeliest, by name."""
     reference = closest(list(trials.values()))
     least = trials[best].losses(reference.fit.scale).sum()
-    return tuple(
-        name
+    return {
+        name: reference.share * float(trial.losses(reference.fit.scale).sum() - least)
         for name, trial in trials.items()
         if name != best
-        and reference.share * float(trial.losses(reference.fit.scale).sum() - least)
-        < EVIDENCE.indistinct_loss
-    )
+    }
 
 
 def _contains(trial: Hypothesis, name: str, law: Effect) -> bool:

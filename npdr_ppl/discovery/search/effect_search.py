@@ -106,7 +106,7 @@ class Searcher(OriginalModel):
                 break
             tested = best if extended is single else None
             current = self.trials.with_own_starts(self._pruned(extended, tested))
-            if self.with_finer_steps(current) is not current:
+            if self._needs_finer_steps(current, rounds[-1]):
                 # The missing effect had hidden that the steps are too coarse.
                 first = now = self._in_present_steps(rounds[0])
                 current, rounds = first.hypothesis, [first]
@@ -116,6 +116,23 @@ class Searcher(OriginalModel):
             now = self.look(current)
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
+
+    def _needs_finer_steps(self, current: Hypothesis, now: Round) -> bool:
+        """Returns whether steps are too coarse for a model or its rivals; they are then refined.
+
+        Errors of the steps differ between laws. A delayed command changes within a step, a late
+        measurement does not: in coarse steps, the wrong one of the two can fit better.
+
+        Args:
+            current: The model with the effects that were added.
+            now: The round that added the last one, with what it tried.
+        """
+        rivals = [
+            trial
+            for name, trial in now.trials.items()
+            if set(trial.names) != set(current.names) and now.weights[name] >= SEARCH.hopeless
+        ]
+        return any(self.with_finer_steps(model) is not model for model in (current, *rivals))
 
     def _in_present_steps(self, first: Round) -> Round:
         """Returns the first round with the original model in the present integration steps.

@@ -248,7 +248,8 @@ def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
     They are the linear estimate, and the typical size if the change is not linear. The linear
     estimate can then be far from the best fit, with a local minimum between them: a lag beside a
     delay that already explains their sum. Many sizes of a resonance are screened, and fits of
-    effects with many minima restart by themselves.
+    effects with many minima restart by themselves. What was found on the recording itself needs no
+    other guess.
     """
     variant, effect = candidate.variant, candidate.variant.effect
     guesses = [variant.parameters(candidate.sizes)]

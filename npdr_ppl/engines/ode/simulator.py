@@ -43,14 +43,24 @@ class ODESimulator(MechanicalSystem):
     on the device of the actions.
     """
 
+    is_finest: bool = False
+    """Whether its steps are those that :meth:`with_finer_steps` returned last."""
+
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy with the next integrator of higher order; ``None`` if there is none."""
+        """Returns a copy with finer steps; ``None`` if there are none.
+
+        It has the next integrator of higher order. If there is none, it has twice as many steps:
+        a command that changes within a step counts with its mean, which no order improves.
+        """
+        if self.is_finest:
+            return None
+        changed = copy.copy(self)
         for finer in map(integrator, FINER):
             if finer.order > self.integrator.order:
-                changed = copy.copy(self)
                 changed.integrator = finer
                 return changed
-        return None
+        changed.substeps, changed.is_finest = 2 * self.substeps, True
+        return changed
 
     def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
         """Returns a copy with midpoint steps in place of Runge-Kutta steps of order four."""
