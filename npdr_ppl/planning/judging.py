@@ -279,14 +279,15 @@ class Judge:
         """
         ranges = (self.known.recorded or {}).get("channels", {})
         reach = np.ptp(self._paths(played)[cause], axis=1)
-        shares = [
-            reach[:, k] / max(min(ranges[name]["max"] - ranges[name]["min"], limit), 1e-300)
-            for k, (name, channel) in enumerate(self.limits.channels.items())
-            if name in ranges
-            for limit in (channel.max - channel.min,)
-            # A joint that rested tells nothing about large motions.
-            if ranges[name]["max"] - ranges[name]["min"] > _RANGE_OF_NOISE * channel.noise
-        ]
+        shares = []
+        for k, (name, channel) in enumerate(self.limits.channels.items()):
+            limit = channel.max - channel.min
+            if name in ranges:
+                recorded = ranges[name]["max"] - ranges[name]["min"]
+                # Of a joint that rested, nothing says how far it usually moves.
+                is_known = recorded > _RANGE_OF_NOISE * channel.noise
+                usual = min(recorded, limit) if is_known else limit
+                shares.append(reach[:, k] / max(usual, 1e-300))
         if not shares:
             return torch.ones(len(reach), dtype=torch.float64)
         moves = np.max(shares, axis=0) / PLANNING.least_motion

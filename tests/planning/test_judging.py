@@ -181,3 +181,20 @@ def test_what_a_tiny_motion_shows_counts_less(surviving):
     torch.testing.assert_close(trusted[0], everything[0])
     share = (tiny / PLANNING.least_motion) ** 2
     torch.testing.assert_close(trusted[1], share * everything[1], rtol=0.01, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_motion_of_a_joint_that_rested_is_compared_with_its_limits(surviving):
+    known, limits = surviving
+    channels = {name: {"min": 0.0, "max": 0.0} for name in limits.channels}
+    rested = replace(known, recorded={**known.recorded, "channels": channels})
+    played = Judge(known, limits, seed=0).played(*candidates(limits, 1))
+    reach = np.ptp(played.readings[0], axis=1)[0]
+    wide = {
+        name: replace(c, min=-4.0 * r / PLANNING.least_motion, max=4.0 * r / PLANNING.least_motion)
+        for (name, c), r in zip(limits.channels.items(), reach, strict=True)
+    }
+    wide = replace(limits, channels=wide)
+    seen, every = (Judge(k, wide, seed=0) for k in (rested, replace(known, recorded=None)))
+    one, other = (judge.information(played, 0) for judge in (seen, every))
+    torch.testing.assert_close(one, other / 8.0**2, rtol=0.05, atol=1e-6)

@@ -82,7 +82,7 @@ class GenericLawSettings:
         most_per_turn: The greatest number. 12 slots and 14 poles have 84. Cogging behind a gear
             has more; a search finds it only if its order is given.
         num_roundings: Number of steps tried to which a command may be rounded. The finest is about
-            a 5000th of the greatest command: 0.6 mrad for a servo that turns by half a turn.
+            a 5000th of the greatest command: 0.6 mrad if that is half a turn.
         num_finer_roundings: Number of steps tried about the strongest one. On the one-joint arms
             of ``benchmarks/servo_laws.py`` (seeds 1000 to 1002 and 1010), the best of 400 is
             within 1e-4 of the hidden step, relatively, from where a fit ends in the right minimum.

@@ -57,7 +57,7 @@ class Added:
         fitting: Names of the alternatives that fit equally well. The simplest law is the
             likeliest. But a law that contains it, as bristles contain dry friction, fits equally
             well if its further parameters have no visible influence.
-        forms: Names of those of them that contain it and fit no better. The recording does not
+        forms: Names of those of them that contain it and fit hardly better. The recording does not
             tell their shape.
         is_compared: Whether it was compared with alternatives; after a time limit it may not be.
     """

@@ -118,7 +118,7 @@ class Searcher(OriginalModel):
         return self._revised(current, rounds, max_effects)
 
     def _needs_finer_steps(self, current: Hypothesis, now: Round) -> bool:
-        """Returns whether steps are too coarse for a model or its rivals; they are then refined.
+        """Returns whether steps are too coarse for a model or its rivals, and refines them then.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
         measurement does not: in coarse steps, the wrong one of the two can fit better.
@@ -127,11 +127,10 @@ class Searcher(OriginalModel):
             current: The model with the effects that were added.
             now: The round that added the last one, with what it tried.
         """
-        rivals = [
-            trial
-            for name, trial in now.trials.items()
-            if set(trial.names) != set(current.names) and now.weights[name] >= SEARCH.hopeless
-        ]
+        likeliest = sorted(now.trials, key=lambda name: now.weights[name], reverse=True)
+        # Others were not fitted to convergence, and would gain by that alone.
+        rivals = [now.trials[name] for name in likeliest[: TRIALS.most_converged]]
+        rivals = [trial for trial in rivals if set(trial.names) != set(current.names)]
         return any(self.with_finer_steps(model) is not model for model in (current, *rivals))
 
     def _in_present_steps(self, first: Round) -> Round:

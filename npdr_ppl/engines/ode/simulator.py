@@ -44,7 +44,7 @@ class ODESimulator(MechanicalSystem):
     """
 
     is_finest: bool = False
-    """Whether its steps are those that :meth:`with_finer_steps` returned last."""
+    """Whether its steps cannot be refined further."""
 
     def with_finer_steps(self) -> Self | None:
         """Returns a copy with finer steps; ``None`` if there are none.

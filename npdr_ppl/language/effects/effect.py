@@ -61,7 +61,7 @@ class Effect(ABC):
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
             is. Priors are too wide to hit a wave's frequency, so a search takes it from the
             spectrum of the residuals and corrects for the number of frequencies it examined.
-        rounds: Name of the parameter that is the step to which it rounds commands, empty if none
+        rounds: Name of the strength that is the step to which it rounds commands, empty if none
             is. A slightly wrong step explains nothing, so a search takes it from the residuals.
         has_ripples: Whether it repeats a whole and unknown number of times per turn of a joint. A
             search finds the number in the same way, and sets it by :meth:`with_ripples`.
