@@ -18,8 +18,8 @@ class Finding:
     Attributes:
         effect: The effect.
         probability: Probability that it is this effect, given all other effects found. Less likely
-            laws that contain it and fit no better count, too: the recording does not tell their
-            shape.
+            laws that contain it and fit hardly better count, too: the recording does not tell
+            their shape.
         alternatives: Probabilities by name, of this effect and of those that could replace it.
         equivalent_to: Ids of causes that the recording possibly cannot distinguish from it.
         share: Share of the misfit that it explains.

@@ -9,10 +9,10 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.cli.resolve import resolve_model
-from npdr_ppl.discovery.screening.generic_laws import strongest_rounding
 from npdr_ppl.discovery.screening.groups import ranked_laws
 from npdr_ppl.discovery.screening.latent_force import responses
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.rounded_commands import strongest_rounding
 from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
 from npdr_ppl.discovery.screening.variants import variants_of

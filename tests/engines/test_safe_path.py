@@ -133,7 +133,7 @@ def test_workers_import_nothing_from_the_current_folder_and_listen_on_loopback_o
     assert done.returncode == 0, done.stderr[-2000:]
     assert ran(hostile) == []
     if find_spec("psutil") is None:
-        pytest.skip("they import nothing; where they listen is not tested without psutil")
+        pytest.skip("without psutil, only their imports are tested, not where they listen")
     number, *places = done.stdout.split()
     if name in ("serial", "threads"):  # in the process itself
         assert not places

@@ -73,8 +73,6 @@ def curves(model: LearnedModel) -> list[Curve]:
                 {},
                 motion.values["t"],
                 model.start.segments.inputs.rollout,
-                {},
-                torch.zeros(0),
             )
             (found,) = latent_force(projection, known)
             estimate, error = found.force, found.error

@@ -70,8 +70,6 @@ class Responses:
             each pulse, ``(S, pulses)``.
         time: Beginning of each pulse in seconds since the rollout began, ``(S, pulses)``.
         rollout: Index of each segment's rollout, ``(S,)``.
-        commands: Commands of all steps, by action, ``(S, K)``.
-        edges: Steps at which pulses begin, and the last one's end, ``(pulses + 1,)``.
     """
 
     by_port: dict[str, Tensor]
@@ -81,17 +79,6 @@ class Responses:
     channels: dict[str, Tensor]
     time: Tensor
     rollout: Tensor
-    commands: dict[str, Tensor]
-    edges: Tensor
-
-    def mean_over_pulses(self, values: Tensor) -> Tensor:
-        """Returns means over the steps of each pulse, ``(S, pulses, k)``.
-
-        Args:
-            values: Values in all steps, ``(S, K, k)``.
-        """
-        parts = values.split(self.edges.diff().tolist(), dim=1)
-        return torch.stack([part.mean(1) for part in parts], dim=1)
 
 
 @dataclass(frozen=True)
@@ -153,22 +140,10 @@ def responses(hypothesis: Hypothesis) -> Responses:
         name: base[:, begins.clamp_min(1) - 1, k].double()
         for k, name in enumerate(segments.channel_names)
     }
-    commands = {
-        name: inputs.actions[..., k].double() for k, name in enumerate(inputs.action_names)
-    }
-    channels |= {name: values[:, begins] for name, values in commands.items()}
+    for k, name in enumerate(inputs.action_names):
+        channels[name] = inputs.actions[:, begins, k].double()
     time = (inputs.start[:, None] + begins) * inputs.time_step
-    return Responses(
-        by_port,
-        units,
-        rated,
-        positions,
-        channels,
-        time.double(),
-        inputs.rollout,
-        commands,
-        edges,
-    )
+    return Responses(by_port, units, rated, positions, channels, time.double(), inputs.rollout)
 
 
 def _measuring(pulse: Pulse, port: Port, segments: SegmentModel) -> str | None:

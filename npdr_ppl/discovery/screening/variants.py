@@ -9,13 +9,10 @@ import torch
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.equivalents import irreducible
-from npdr_ppl.discovery.screening.generic_laws import (
-    strongest_frequency,
-    strongest_ripple,
-    strongest_rounding,
-)
+from npdr_ppl.discovery.screening.generic_laws import strongest_frequency, strongest_ripple
 from npdr_ppl.discovery.screening.latent_force import Responses
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.rounded_commands import strongest_rounding
 from npdr_ppl.discovery.screening.sensitivities import Variant, sensitivities
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect

@@ -303,17 +303,16 @@ def log_prior(hypothesis: Hypothesis) -> float:
 
     The same holds for numbers of ripples, and for steps of commands.
     """
-    tried = [
-        number
-        for effect in hypothesis.effects
-        for is_searched, number in (
-            (effect.wave, GENERIC_LAWS.num_frequencies),
-            (effect.has_ripples, len(PER_TURN)),
-            (effect.rounds, GENERIC_LAWS.num_roundings),
-        )
-        if is_searched
-    ]
-    return -sum(map(math.log, tried))
+    return -sum(math.log(_num_tried(effect)) for effect in hypothesis.effects)
+
+
+def _num_tried(effect: Effect) -> int:
+    """Returns of how many values the recording chose one before the effect was fitted."""
+    if effect.wave:
+        return GENERIC_LAWS.num_frequencies
+    if effect.has_ripples:
+        return len(PER_TURN)
+    return GENERIC_LAWS.num_roundings if effect.rounds else 1
 
 
 def _excess_losses(trials: Mapping[str, Hypothesis], best: str) -> dict[str, float]:

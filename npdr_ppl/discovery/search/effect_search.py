@@ -106,7 +106,7 @@ class Searcher(OriginalModel):
                 break
             tested = best if extended is single else None
             current = self.trials.with_own_starts(self._pruned(extended, tested))
-            if self._needs_finer_steps(current, rounds[-1]):
+            if self._refines_steps(current, rounds[-1]):
                 # The missing effect had hidden that the steps are too coarse.
                 first = now = self._in_present_steps(rounds[0])
                 current, rounds = first.hypothesis, [first]
@@ -117,8 +117,8 @@ class Searcher(OriginalModel):
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
 
-    def _needs_finer_steps(self, current: Hypothesis, now: Round) -> bool:
-        """Returns whether steps are too coarse for a model or its rivals, and refines them then.
+    def _refines_steps(self, current: Hypothesis, now: Round) -> bool:
+        """Refines integration steps that are too coarse for a model or one of its rivals.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
         measurement does not: in coarse steps, the wrong one of the two can fit better.
@@ -126,6 +126,9 @@ class Searcher(OriginalModel):
         Args:
             current: The model with the effects that were added.
             now: The round that added the last one, with what it tried.
+
+        Returns:
+            Whether they were refined.
         """
         likeliest = sorted(now.trials, key=lambda name: now.weights[name], reverse=True)
         # Others were not fitted to convergence, and would gain by that alone.
