@@ -4,14 +4,16 @@
     python benchmarks/planning.py --summary planning.jsonl
 
 A case begins with the first half of one rollout of a rig of :mod:`hidden_rigs`, with one effect
-hidden whose strength is a part of the rig's typical size. It counts if the verdict of ``discover``
-is ``ambiguous``, the hidden effect is among the causes that are left, and so is one that a
-recording of the rig can tell from it. Then one recording is planned, with as many rollouts as
-:func:`npdr_ppl.planning.plan_recording` chooses, and played on the rig. ``discover`` gets it with
-the first one. The same is done with as many random rollouts within the same limits: the first
-random excitations of the search that keep them. The limits are the rig's greatest commands, twice
-the positions and speeds of its usual recordings, twice the length of the first one and three times
-its bandwidth, and any pose from which the rig's rollouts are let go.
+hidden. There are two kinds. With ``--cases weak``, the strength is a part of the rig's typical
+size, down to a twentieth. With ``--cases gentle``, the effect has its typical size, and commands and
+pose of the first recording are a part of the usual ones, down to a tenth. A case counts if the
+verdict of ``discover`` is ``ambiguous``, the hidden effect is among the causes that are left, and so
+is one that a recording of the rig can tell from it. Then one recording is planned, with as many
+rollouts as :func:`npdr_ppl.planning.plan_recording` chooses, and played on the rig. ``discover``
+gets it with the first one. The same is done with as many random rollouts within the same limits:
+the first random excitations of the search that keep them. The limits are the rig's greatest
+commands, twice the positions and speeds of its usual recordings, twice the length of the first one
+and three times its bandwidth, and any pose from which the rig's rollouts are let go.
 
 Told apart means that no such cause is left: the verdict names the hidden effect or what no
 recording tells from it, or only these are left. A case is undecidable if the plan itself predicts
@@ -58,7 +60,11 @@ NAMED = 0.05
 """Probability from which a cause is left, as in the verdict."""
 
 STRENGTHS = (0.05, 0.1, 0.2, 0.4)
-"""Multiples of an effect's typical size, in turn: weak effects are ambiguous more often."""
+"""Multiples of an effect's typical size, drawn for each weak case: weak effects are ambiguous more
+often."""
+
+AMPLITUDES = (0.1, 0.2, 0.4)
+"""Shares of the usual commands and poses, drawn for each gentle case."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +76,17 @@ class Task:
         place: Index of the hidden effect among the rig's.
         strength: Multiple of its typical size.
         seed: The case's seed.
+        amplitude: Commands and pose of the first recording, as a share of the usual ones.
     """
 
     rig: str
     place: int
     strength: float
     seed: int
+    amplitude: float = 1.0
 
 
-def tasks(rigs: list[str], first: int) -> Iterator[Task]:
+def tasks(rigs: list[str], first: int, kind: str) -> Iterator[Task]:
     """Yields cases without end: rigs and effects in random order, then those of other seeds."""
     for number in itertools.count(first):
         seed = FIRST_SEED + number
@@ -86,7 +94,10 @@ def tasks(rigs: list[str], first: int) -> Iterator[Task]:
         generator = np.random.default_rng(seed)
         for index in generator.permutation(len(places_of)):
             rig, place = places_of[index]
-            yield Task(rig, place, float(generator.choice(STRENGTHS)), seed)
+            if kind == "weak":
+                yield Task(rig, place, float(generator.choice(STRENGTHS)), seed)
+            else:
+                yield Task(rig, place, 1.0, seed, float(generator.choice(AMPLITUDES)))
 
 
 def judge(task: Task, rounds: int) -> dict[str, Any]:
@@ -140,7 +151,11 @@ def _first(case: Case, task: Task) -> Rollouts:
     """Returns the first half of a rollout, from rest or let go elsewhere in turn."""
     whole = case.fit[[task.place % 2]]
     num = round(FIRST_SHARE * whole.lengths[0])
-    return _like(whole, [whole.readings[0][: num + 1]], [whole.actions[0][:num]])
+    first = _like(whole, [whole.readings[0][: num + 1]], [whole.actions[0][:num]])
+    if task.amplitude == 1.0:
+        return first
+    commands, start = first.actions[0], first.readings[0][0]
+    return play(case, task.amplitude * commands, task.amplitude * start, seed=100 * task.seed + 99)
 
 
 def _played(case: Case, planned: Rollouts, seed: int) -> Rollouts:
@@ -294,6 +309,7 @@ def main() -> None:
     """Runs the benchmark."""
     parser = argparse.ArgumentParser(description="Planned against random recordings.")
     parser.add_argument("--rigs", default="pendulum,furuta,cart_pole,emps")
+    parser.add_argument("--cases", choices=("weak", "gentle"), default="weak")
     parser.add_argument("--num", type=int, default=60, help="ambiguous cases to plan for")
     parser.add_argument("--rounds", type=int, default=30, help="batches of the search")
     parser.add_argument("--first", type=int, default=100, help="number of the first cases")
@@ -307,9 +323,9 @@ def main() -> None:
     torch.set_num_threads(1)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     rows = [json.loads(line) for line in lines]
-    done = {Task(r["rig"], r["place"], r["strength"], r["seed"]) for r in rows}
+    done = {Task(*(r[key] for key in Task.__annotations__)) for r in rows}
     begin, num = time.monotonic(), sum(map(is_ambiguous, rows))
-    for task in tasks(arguments.rigs.split(","), arguments.first):
+    for task in tasks(arguments.rigs.split(","), arguments.first, arguments.cases):
         if num >= arguments.num or time.monotonic() - begin > arguments.most_seconds:
             break
         if task in done:

@@ -428,7 +428,11 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
 def _relative(found: Mapping[str, float], present: Mapping[str, float]) -> float:
     """Returns misfits relative to those of the same channels in the recording as it was read."""
     before = {name: present[name] for name in found if name in present}
-    return _rms(found) / (_rms(before) if before else 1.0)
+    after, reference = _rms(found), _rms(before) if before else 1.0
+    if reference > 0.0:
+        return after / reference
+    # Channels that rest within their resolution cannot be explained better.
+    return 1.0 if after == 0.0 else math.inf
 
 
 def _rms(misfits: Mapping[str, float]) -> float:

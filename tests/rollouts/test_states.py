@@ -102,6 +102,22 @@ def test_a_reading_that_fades_away():
     assert np.isfinite(estimate.values).all() and np.isfinite(estimate.value_errors).all()
 
 
+def test_the_first_value_of_rollouts_that_begin_alike_has_no_common_error():
+    """Released at rest, a pendulum's speed has a bend that a one-sided window smooths away."""
+    rng = np.random.default_rng(0)
+    time = 0.01 * np.arange(200)
+    speed = -4.0 * np.sin(4.0 * time) + 0.3 * np.sin(60.0 * time)
+    errors = np.array(
+        [
+            estimate_states(
+                (speed + 0.02 * rng.normal(size=200))[:, None], np.array([0]), 0.01
+            ).values[0, 0]
+            for _ in range(60)
+        ]
+    )
+    assert abs(errors.mean()) < 3.0 * 0.02 / 60**0.5
+
+
 @pytest.mark.parametrize("num_rows", [2, 3, 4, 5])
 def test_very_short_rollouts(num_rows):
     readings = (3.0 + 2.0 * np.arange(num_rows))[:, None]

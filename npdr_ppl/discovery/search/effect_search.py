@@ -130,6 +130,8 @@ class Searcher(OriginalModel):
         Returns:
             Whether they were refined.
         """
+        if self._deadline.stops():
+            return False
         likeliest = sorted(now.trials, key=lambda name: now.weights[name], reverse=True)
         # Others were not fitted to convergence, and would gain by that alone.
         rivals = [now.trials[name] for name in likeliest[: TRIALS.most_converged]]
@@ -254,7 +256,7 @@ class Searcher(OriginalModel):
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         prior = [
-            math.log(1 - SEARCH.prior_of_any),
+            math.log(1 - SEARCH.prior_of_any) + log_prior(current),
             *(each + log_prior(t) for t in trials.values()),
         ]
         weights = dict(zip(("", *trials), weigh(hypotheses, prior), strict=True))
