@@ -5,15 +5,15 @@
 
 A case begins with the first half of one rollout of a rig of :mod:`hidden_rigs`, with one effect
 hidden. There are two kinds. With ``--cases weak``, the strength is a part of the rig's typical
-size, down to a twentieth. With ``--cases gentle``, the effect has its typical size, and commands and
-pose of the first recording are a part of the usual ones, down to a tenth. A case counts if the
-verdict of ``discover`` is ``ambiguous``, the hidden effect is among the causes that are left, and so
-is one that a recording of the rig can tell from it. Then one recording is planned, with as many
-rollouts as :func:`npdr_ppl.planning.plan_recording` chooses, and played on the rig. ``discover``
-gets it with the first one. The same is done with as many random rollouts within the same limits:
-the first random excitations of the search that keep them. The limits are the rig's greatest
-commands, twice the positions and speeds of its usual recordings, twice the length of the first one
-and three times its bandwidth, and any pose from which the rig's rollouts are let go.
+size, down to a twentieth. With ``--cases gentle``, the effect has its typical size, and commands
+and pose of the first recording are a part of the usual ones, down to a tenth. A case counts if
+the verdict of ``discover`` is ``ambiguous``, the hidden effect is among the causes that are left,
+and so is one that a recording of the rig can tell from it. Then one recording is planned, with as
+many rollouts as :func:`npdr_ppl.planning.plan_recording` chooses, and played on the rig.
+``discover`` gets it with the first one. The same is done with as many random rollouts within the
+same limits: the first random excitations of the search that keep them. The limits are the rig's
+greatest commands, twice the positions and speeds of its usual recordings, twice the length of the
+first one and three times its bandwidth, and any pose from which the rig's rollouts are let go.
 
 Told apart means that no such cause is left: the verdict names the hidden effect or what no
 recording tells from it, or only these are left. A case is undecidable if the plan itself predicts

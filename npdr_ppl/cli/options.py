@@ -108,7 +108,7 @@ OutOption = Annotated[
 _ROLLOUTS = typer.Option(
     min=1,
     help="Rollouts to record: by train in each iteration; for plan, by default one, or as many as "
-    "tell several causes apart, at most 6.",
+    "tell several causes apart, in all at most two minutes.",
 )
 RolloutsOption = Annotated[int, _ROLLOUTS]
 OptionalRolloutsOption = Annotated[int | None, _ROLLOUTS]
