@@ -33,17 +33,12 @@ def versions() -> dict[str, str]:
 
 
 def model_name(model: Any) -> str:
-    """Returns the name of a model with what is attached to it; the same in every process.
-
-    A function that is just called ``model``, as that of a robot's file, is named after its file.
-    """
+    """Returns the name of a model with what is attached to it; the same in every process."""
     if _is_wrapped(model):
         return model_name(model.args[-1])
     if isinstance(model, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
         return repr(model)
-    name = getattr(model, "__name__", type(model).__name__)
-    code = getattr(model, "__code__", None)
-    return Path(code.co_filename).stem if name == "model" and code is not None else name
+    return getattr(model, "__name__", type(model).__name__)
 
 
 def source_text(model: Any) -> str:

@@ -90,7 +90,7 @@ def estimate_states(
     while its interval still overlaps those of all smaller windows, i.e. until bias becomes
     visible. No global smoothness is assumed, so slow and fast parts of a swing-up get different
     windows. At the ends of a rollout, windows are one-sided. At its first row, the value is the
-    measurement itself if that is more accurate.
+    measurement itself if that is more accurate than a window that bias limits.
 
     Args:
         readings: ``(T + 1, C)``, constant sampling, in the channels' units.
@@ -105,12 +105,13 @@ def estimate_states(
         1999 (the rule).
     """
     noises = _noises(readings, is_read)
-    value, rate, value_error, rate_error, _ = _adaptive(
+    value, rate, value_error, rate_error, is_stopped = _adaptive(
         readings, steps, noises, _num_changes(readings, is_read)
     )
     value_error, rate_error = ERROR_RATIOS[0] * value_error, ERROR_RATIOS[1] * rate_error
-    # A window to one side has the same bias in every rollout that begins in the same way.
-    is_closer = (noises < value_error) & (steps[:, None] == 0)
+    # A one-sided window has the same bias in all rollouts that begin alike. Averaging over rollouts
+    # does not remove it, and it looks like a delay. The error stays that of the window, the larger.
+    is_closer = (noises < value_error) & is_stopped[0] & (steps[:, None] == 0)
     if is_read is not None:
         is_closer &= is_read[steps]
     value = np.where(is_closer, readings[steps], value)
