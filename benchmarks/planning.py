@@ -152,7 +152,7 @@ def _first(case: Case, task: Task) -> Rollouts:
     whole = case.fit[[task.place % 2]]
     num = round(FIRST_SHARE * whole.lengths[0])
     first = _like(whole, [whole.readings[0][: num + 1]], [whole.actions[0][:num]])
-    if task.amplitude == 1.0:
+    if task.amplitude == 1.0:  # a weak case
         return first
     commands, start = first.actions[0], first.readings[0][0]
     return play(case, task.amplitude * commands, task.amplitude * start, seed=100 * task.seed + 99)
@@ -323,7 +323,7 @@ def main() -> None:
     torch.set_num_threads(1)
     lines = arguments.out.read_text().splitlines() if arguments.out.exists() else []
     rows = [json.loads(line) for line in lines]
-    done = {Task(*(r[key] for key in Task.__annotations__)) for r in rows}
+    done = {Task(**{key: r[key] for key in Task.__annotations__ if key in r}) for r in rows}
     begin, num = time.monotonic(), sum(map(is_ambiguous, rows))
     for task in tasks(arguments.rigs.split(","), arguments.first, arguments.cases):
         if num >= arguments.num or time.monotonic() - begin > arguments.most_seconds:

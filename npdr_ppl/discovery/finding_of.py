@@ -77,6 +77,7 @@ def finding_of(
         if (probability >= EVIDENCE.least_probability or name in added.fitting)
         and name != effect.name
     ]
+    alternatives += added.forms
     known = equivalents(effect, search.final.names)
     ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in alternatives] + list(known))
     return Finding(

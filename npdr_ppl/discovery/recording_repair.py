@@ -308,7 +308,8 @@ class _Trials:
                 start = known[min(known, key=lambda steps: abs(steps - shift.steps))]
         try:
             changed = remedy.apply(self._rollouts)
-            if self._few is not None:
+            # Where all rests in the few segments, they tell nothing.
+            if self._few is not None and _rms(self._present_in_few) > 0.0:
                 first = self._few.fitted(self._model, changed, start)
                 if first is None:
                     return math.inf
@@ -428,7 +429,8 @@ def _misfits(hypothesis: Hypothesis) -> dict[str, float]:
 def _relative(found: Mapping[str, float], present: Mapping[str, float]) -> float:
     """Returns misfits relative to those of the same channels in the recording as it was read."""
     before = {name: present[name] for name in found if name in present}
-    after, reference = _rms(found), _rms(before) if before else 1.0
+    after = _rms(found)
+    reference = _rms(before) if before else 1.0
     if reference > 0.0:
         return after / reference
     # Channels that rest within their resolution cannot be explained better.

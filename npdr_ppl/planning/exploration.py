@@ -25,8 +25,7 @@ class Explored:
         found: The course of the search.
         played: The best candidates, then random ones.
         num_pool: Number of the best ones.
-        every: Indices of the candidates that a plan may use. Random ones that are also among the
-            best are in it once.
+        every: Indices of the candidates that a plan may use; of equal ones, the first.
     """
 
     judge: Judge
@@ -34,6 +33,11 @@ class Explored:
     played: Played
     num_pool: int
     every: Sequence[int]
+
+    @property
+    def most_rollouts(self) -> int:
+        """Greatest number of rollouts that differ, of a plan and of as many random ones."""
+        return min(len(self.every), len(self.played.commands) - self.num_pool)
 
     def random(self, number: int) -> list[int]:
         """Returns a number of random candidates, in turn if there are fewer."""
@@ -82,12 +86,16 @@ def explore(
     most = num_candidates or judge.most_shown
     pool, random = found.pool[:most], found.random[:most]
     played = played_by(excitations, judge, [*pool, *random])
-    others = [
-        number
-        for number, candidate in enumerate(random, len(pool))
-        if not any(candidate is better for better in pool)
-    ]
-    return Explored(judge, found, played, len(pool), [*range(len(pool)), *others])
+    return Explored(judge, found, played, len(pool), _different(played))
+
+
+def _different(played: Played) -> list[int]:
+    """Returns the first of each group of candidates with the same commands and start."""
+    found: dict[tuple[bytes, bytes], int] = {}
+    for number, made in enumerate(zip(played.commands, played.start, strict=True)):
+        commands, start = made
+        found.setdefault((commands.tobytes(), start.tobytes()), number)
+    return list(found.values())
 
 
 def _nothing_found(known: Known, judge: Judge, found: Found) -> DataError:

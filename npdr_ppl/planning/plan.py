@@ -73,10 +73,10 @@ class Outlook:
     Attributes:
         planned: The chance that it names the right cause, and a wrong one, after the plan.
         random: The same after as many random rollouts.
-        needed: Smallest number of such rollouts after which the chance is at least 0.9; ``None``
+        needed: Smallest number of such rollouts after which the chance is at least 0.95; ``None``
             if more than 60 would be needed.
         wider: The chance with each limit up to twice as wide, if that of the plan is less than
-            0.9.
+            0.95.
     """
 
     planned: Chance
@@ -194,7 +194,8 @@ def plan_recording(
     if not is_separating:
         return _informing(known, explored, rollouts or 1)
     searched = time.monotonic()
-    plan = _separating(known, explored, rollouts)
+    most = rollouts or _most_rollouts(explored)
+    plan = _separating(known, explored, rollouts, most)
     outlook = plan.outlook
     if outlook is None or outlook.planned.right >= PLANNING.wanted:
         return plan
@@ -203,7 +204,7 @@ def plan_recording(
     wider = chances_with_wider_limits(
         known,
         limits,
-        len(plan.recording),
+        most,
         seed=seed,
         time_limit=time_limit - (figured - begin),
         least_time=figured - searched,
@@ -224,61 +225,53 @@ def _check(limits: Limits, rollouts: int | None) -> None:
         )
 
 
-def _separating(known: Known, explored: Explored, rollouts: int | None) -> Plan:
+def _most_rollouts(explored: Explored) -> int:
+    """Returns how many rollouts a plan may have that the user asked no number of."""
+    in_time = int(PLANNING.most_recorded / explored.judge.limits.duration + 1e-9)
+    return max(1, min(PLANNING.most_needed, in_time, explored.most_rollouts))
+
+
+def _separating(known: Known, explored: Explored, rollouts: int | None, most: int) -> Plan:
     """Returns the plan that tells several causes apart.
 
     Args:
         known: The causes.
         explored: The candidates.
         rollouts: Number of rollouts; ``None`` for as many as are needed.
+        most: Greatest number of rollouts.
     """
     shown = explored.judge.shown(explored.played)
-    duration = explored.judge.limits.duration
-    in_time = max(1, int(PLANNING.most_recorded / duration))
-    allowed = rollouts or min(PLANNING.most_needed, in_time)
     every = rollouts_that_separate(
         known,
         shown,
         explored.every,
         least=rollouts or 1,
-        most=max(allowed, PLANNING.most_needed),
-        num_distinct=allowed,
+        most=max(most, PLANNING.most_needed),
+        num_distinct=most,
     )
-    chosen = every[:allowed] if rollouts else _that_help(known, shown, every[:allowed])
+
+    def fewest(wanted: float, candidates: Sequence[int]) -> int | None:
+        """Returns how many of the first candidates suffice; ``None`` if not even all do."""
+
+        def suffice(number: int) -> bool:
+            return chance_of(known, shown, candidates[:number]).right >= wanted
+
+        if not suffice(len(candidates)):
+            return None
+        return next(filter(suffice, range(1, len(candidates))), len(candidates))
+
+    chosen = every[:most]
+    reached = chance_of(known, shown, chosen)
+    if not rollouts and reached.right < PLANNING.wanted:
+        chosen = chosen[: fewest(reached.right - PLANNING.least_chance_gain, chosen)]
     random = explored.random(len(chosen))
     outlook = Outlook(
         chance_of(known, shown, chosen),
         chance_of(known, shown, random),
-        _needed(known, shown, every, rollouts),
+        fewest(PLANNING.wanted, every),
     )
     pairs = _pairs(known, shown, chosen, random)
     return _plan(explored, chosen, random, pairs=pairs, outlook=outlook)
-
-
-def _that_help(known: Known, shown: Shown, chosen: Sequence[int]) -> Sequence[int]:
-    """Returns the first candidates without the last ones if these hardly add to the chance."""
-    reached = chance_of(known, shown, chosen).right
-    if reached >= PLANNING.wanted:
-        return chosen
-    wanted = reached - PLANNING.least_chance_gain
-
-    def suffice(number: int) -> bool:
-        return chance_of(known, shown, chosen[:number]).right >= wanted
-
-    return chosen[: next(filter(suffice, range(1, len(chosen))), len(chosen))]
-
-
-def _needed(known: Known, shown: Shown, every: Sequence[int], rollouts: int | None) -> int | None:
-    """Returns how many of the chosen candidates suffice; ``None`` if all of them do not."""
-
-    def suffice(number: int) -> bool:
-        return chance_of(known, shown, every[:number]).right >= PLANNING.wanted
-
-    if not suffice(len(every)):
-        return None
-    # Without a number of rollouts, none was added after they sufficed.
-    fewer = range(1, min(rollouts or 1, len(every)))
-    return next((number for number in fewer if suffice(number)), len(every))
 
 
 def _informing(known: Known, explored: Explored, rollouts: int) -> Plan:

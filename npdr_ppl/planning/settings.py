@@ -40,21 +40,22 @@ class PlanningSettings:
         num_draws: Number of prior draws over which information is averaged.
         num_smoothed: Number of simulated recordings from which the errors of initial states are
             estimated.
-        num_noises: Number of times that noise is added to them for the first state, of which each
-            has only one.
+        num_noises: Number of noise draws per simulated recording for the errors of its first
+            state. A recording has many segments, but only one first state.
         relative_noise: Standard deviation of a channel's noise as a share of its rated value, if
             nothing is known. An encoder of 4096 counts per turn has 0.0004 rad.
-        pool: Number of the best candidates, and of random ones, that are kept for a plan.
-        most_recorded: Greatest total duration in seconds of a plan's rollouts, unless the user
-            asks for more rollouts or one takes longer. Many robots need a reset before each.
-        least_chance_gain: Rollouts that together add less than this to the chance are left out.
-            It is twice the standard error of a chance.
+        pool: Greatest number of the best candidates, and of random ones, among which the rollouts
+            of a plan are chosen.
+        most_recorded: Greatest total duration in seconds of the rollouts of a plan. The user can
+            ask for more, and a plan has at least one rollout.
+        least_chance_gain: If the wanted chance is not reached, the last rollouts are left out if
+            together they add less than this. It is twice the greatest standard error of a chance.
         most_needed: Greatest number of rollouts up to which the number that would be needed is
             told; more of 10 s each take over 10 minutes.
         search_share: Share of the time limit for the search, if there are causes to tell apart.
             The rest is for what would be possible with wider limits.
-        wanted: Chance of naming the right cause from which no further rollout is added; that with
-            which discovery itself names a cause.
+        wanted: Chance of naming the right cause from which no further rollout is added. Another
+            rollout takes seconds, another plan a further session with the robot.
         least_likely: Probability of a cause that was stored as zero.
         num_datasets: Number of simulated recordings from which the chance of naming is computed;
             its standard error is at most 0.025.
@@ -87,7 +88,7 @@ class PlanningSettings:
     least_chance_gain: float = 0.05
     most_needed: int = 60
     search_share: float = 0.7
-    wanted: float = 0.9
+    wanted: float = 0.95
     least_likely: float = 1e-6
     num_datasets: int = 400
     num_resamplings: int = 100
@@ -101,8 +102,7 @@ class PlanningSettings:
         check_range(
             self, 1, 1000, "batch", "tried_per_place", "most_weaker", "first_batches", "num_draws"
         )
-        check_range(self, 1, 100, "num_smoothed", "num_noises", "pool")
-        check_range(self, 1, 100, "most_needed")
+        check_range(self, 1, 100, "num_smoothed", "num_noises", "pool", "most_needed")
         check_range(self, 10, 10_000, "num_datasets", "num_resamplings")
         check_range(self, 1, self.batch, "elites")
         check_range(self, 0.0, 1.0, "step", "shrink", "least_step", "amplitudes", "margin")

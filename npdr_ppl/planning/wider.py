@@ -22,8 +22,8 @@ class Wider:
 
     Attributes:
         limit: ``"commands"``, ``"bandwidth"`` or ``"channels"``.
-        chance: The chance with as many rollouts as the plan has. The search is short, so a longer
-            one can find more.
+        chance: The chance with as many rollouts as a plan may have. The search is short, so a
+            longer one can find more.
     """
 
     limit: str
@@ -44,7 +44,7 @@ def chances_with_wider_limits(
     Args:
         known: The causes, at the time step of the limits.
         limits: The limits of the plan.
-        number: Number of rollouts.
+        number: Number of rollouts that a plan may have.
         seed: Seed of the searches.
         time_limit: Seconds after which no further kind is searched.
         least_time: Seconds that a kind takes at least, as the final figures of the plan did. No

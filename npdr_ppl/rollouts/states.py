@@ -109,8 +109,8 @@ def estimate_states(
         readings, steps, noises, _num_changes(readings, is_read)
     )
     value_error, rate_error = ERROR_RATIOS[0] * value_error, ERROR_RATIOS[1] * rate_error
-    # A one-sided window has the same bias in all rollouts that begin alike. Averaging over rollouts
-    # does not remove it, and it looks like a delay. The error stays that of the window, the larger.
+    # A one-sided window has the same bias in all rollouts that begin alike. Averaging over these
+    # does not remove it, and it looks like a delay. The window's error, the larger one, is kept.
     is_closer = (noises < value_error) & is_stopped[0] & (steps[:, None] == 0)
     if is_read is not None:
         is_closer &= is_read[steps]

@@ -20,6 +20,8 @@ from tests.helpers.command_line import run_for_module
 
 pytestmark = pytest.mark.slow
 
+CAUSES = {"hinge.coulomb_friction", "hinge.load_dependent_friction"}
+
 MODEL = """
 from hidden_rigs.under_test import pendulum as model
 """
@@ -38,9 +40,11 @@ def planned(surviving):
 
 
 def test_a_plan_separates_more_than_a_random_recording(planned):
-    dry = next(p for p in planned.pairs if "presliding" in p.one + p.other)
-    assert dry.before < 1.5
-    assert dry.after > 1.5 * dry.random
+    (friction,) = planned.pairs
+    assert {friction.one, friction.other} == CAUSES
+    assert friction.before < 4.0
+    added, by_chance = (d**2 - friction.before**2 for d in (friction.after, friction.random))
+    assert added > 1.5 * by_chance
     assert planned.to_dict()["smallest_separation"] == min(p.after for p in planned.pairs)
 
 
@@ -50,7 +54,7 @@ def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
     outlook = found.outlook
     assert outlook.planned.right >= planned.outlook.planned.right - 0.05
     assert 0.0 <= outlook.planned.wrong < 0.1
-    most = int(PLANNING.most_recorded / limits.duration)
+    most = round(PLANNING.most_recorded / limits.duration)
     if outlook.planned.right < PLANNING.wanted:
         assert len(found.recording) <= most
         assert outlook.needed is None or outlook.needed > most
@@ -70,6 +74,8 @@ def test_as_many_rollouts_are_planned_as_are_needed(surviving, planned):
 
 def test_a_plan_that_does_not_suffice_says_what_wider_limits_would_give(surviving):
     known, limits = surviving
+    # Equally likely, as if the recording so far told nothing.
+    known = replace(known, causes=tuple(replace(c, probability=0.5) for c in known.causes))
     channels = {n: replace(c, noise=30.0 * c.noise) for n, c in limits.channels.items()}
     narrow = replace(limits, channels=channels, duration=0.5 * limits.duration)
     found = plan_recording(known, narrow, rollouts=1, rounds=1, seed=1)
@@ -301,7 +307,7 @@ def test_the_command_writes_commands_to_play(ambiguous, tmp_path):
     code, text, err = run_for_module(*words)
     assert code == 0, err
     assert "to name the right cause" in " ".join(text.split())
-    assert "hinge.presliding_friction" in text
+    assert all(cause in text for cause in CAUSES)
     read = npdr.Rollouts.from_csv(out)
     assert read.action_names == ("torque",) and read.channel_names == ("angle", "velocity")
     code, _, err = run_for_module(*words)

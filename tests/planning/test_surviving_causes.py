@@ -1,15 +1,12 @@
-"""What a discovery keeps for planning: ranges of the recording, and the causes that are left."""
+"""The ranges of a recording that a discovery keeps for planning."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.proof.surviving_causes import ranges, surviving_causes
-from npdr_ppl.discovery.search.alternatives import Added
-from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.discovery.proof.surviving_causes import ranges
 
 
 def recording(*stretches):
@@ -39,20 +36,3 @@ def test_a_robot_can_start_where_its_rollouts_began(stretches, starts):
     assert (angle["start_min"], angle["start_max"]) == starts
     assert angle["max"] == 40.2
     assert found["actions"]["torque"]["max_rate"] == pytest.approx(10.0)
-
-
-def test_a_law_that_contains_the_likeliest_and_fits_hardly_better_is_no_further_cause():
-    dry, drifting, drag = "hinge.coulomb_friction", "hinge.friction_drift", "hinge.quadratic_drag"
-    added = Added(
-        CoulombFriction("hinge"),
-        dry,
-        share=1.0,
-        alternatives={dry: 0.6, drifting: 0.25, drag: 0.15},
-        fitting=(drifting,),
-        forms=(drifting,),
-    )
-    trials = {(dry, name): SimpleNamespace(can_be_linearised=True) for name in added.alternatives}
-    search = SimpleNamespace(added=[added], trials=trials)
-    found = surviving_causes(search, dry)
-    assert found.hypotheses == (trials[dry, dry], trials[dry, drag])
-    assert found.probabilities == pytest.approx((0.85, 0.15))

@@ -110,16 +110,10 @@ def surviving_causes(search: Search, doubtful: str | None) -> SurvivingCauses:
 
 
 def _alternatives(search: Search, added: Added) -> Mapping[str, tuple[Hypothesis, float]]:
-    """Returns an effect's alternatives that remain possible, with their probabilities, by name.
-
-    Laws that contain the effect and fit hardly better count for it.
-    """
-    probabilities = {n: p for n, p in added.alternatives.items() if n not in added.forms}
-    if added.effect.name in probabilities:
-        probabilities[added.effect.name] = added.probability
+    """Returns an effect's alternatives that remain possible, with their probabilities, by name."""
     return {
         name: (search.trials[added.place, name], probability)
-        for name, probability in probabilities.items()
+        for name, probability in added.alternatives.items()
         if (probability >= EXPERIMENT.least_probability or name in added.fitting)
         and (added.place, name) in search.trials
     }

@@ -53,7 +53,7 @@ class Added:
         place: Name of the effect that it replaced, or its own; the key of its trials.
         share: Share of the explained misfit that is lost without it.
         alternatives: Probability of each alternative, itself included, given all other effects,
-            by name.
+            by name. That of the effect includes those of its forms, which are not among them.
         fitting: Names of the alternatives that fit equally well. The simplest law is the
             likeliest. But a law that contains it, as bristles contain dry friction, fits equally
             well if its further parameters have no visible influence.
@@ -73,7 +73,7 @@ class Added:
     @property
     def probability(self) -> float:
         """Probability of the effect, alone or within a law that contains it, given all others."""
-        return sum(self.alternatives[name] for name in (self.effect.name, *self.forms))
+        return self.alternatives[self.effect.name]
 
 
 @dataclass(frozen=True)
@@ -256,6 +256,7 @@ def weigh_alternatives(
         for name in fitting
         if _contains(trials[name], name, chosen) and excess[name] > -EVIDENCE.indistinct_loss
     )
+    weights[best] += sum(weights.pop(name) for name in forms)
     if best == effect.name and not alternatives.is_better:
         swapped = current
     return swapped, Added(chosen, effect.name, share, weights, fitting, forms)
