@@ -107,8 +107,8 @@ OutOption = Annotated[
 ]
 _ROLLOUTS = typer.Option(
     min=1,
-    help="Rollouts to record: by train in each iteration; for plan, by default one, or as many as "
-    "tell several causes apart, in all at most two minutes.",
+    help="Rollouts to record: by train in each iteration; for plan, by default one, or to tell "
+    "causes apart as many as are needed, in all at most two minutes.",
 )
 RolloutsOption = Annotated[int, _ROLLOUTS]
 OptionalRolloutsOption = Annotated[int | None, _ROLLOUTS]

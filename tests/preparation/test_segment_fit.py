@@ -113,7 +113,7 @@ def test_a_segment_that_stands_out_stays_where_it_was_recorded():
 
 
 @pytest.mark.slow
-def test_many_fits_leap_out_of_the_dents_that_play_leaves_in_the_misfit(monkeypatch):
+def test_restarts_leave_many_local_minima_that_play_makes(monkeypatch):
     def num_found():
         # Other local minima are hundreds away; what a few more steps might gain is less than this.
         return sum(above < 10.0 for seed in (74, 75) for above in _above_the_least(seed))
