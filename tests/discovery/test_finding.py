@@ -159,7 +159,7 @@ def test_a_law_that_contains_another_is_named_where_it_shows_and_else_reported()
 
     def name(hidden, strength):
         place = ("hinge", hidden)
-        # Bristles fit weak dry friction equally well with five of eight seeds, of which this is one.
+        # Bristles fit weak dry friction equally well with five of eight seeds, and with this one.
         _, found = discover("pendulum", "one", (place,), strength=strength, effects=few, seed=2001)
         (finding,) = found.effects
         return finding
@@ -209,7 +209,7 @@ def test_a_resonance_without_its_entry_is_unknown():
         InputDelay("torque"),
     )
     place = ("hinge", "joint_elasticity")
-    # With three of eight seeds, what play leaves of so weak a resonance is too little for an alarm.
+    # With three of eight seeds, what play leaves is too little for an alarm; not with this one.
     _, found = discover(
         "pendulum", "one", (place,), strength=0.3, max_effects=2, effects=effects, seed=2005
     )
