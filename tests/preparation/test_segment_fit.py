@@ -114,21 +114,21 @@ def test_a_segment_that_stands_out_stays_where_it_was_recorded():
 
 @pytest.mark.slow
 def test_restarts_leave_many_local_minima_that_play_makes(monkeypatch):
+    # Other local minima are hundreds away; what a few more steps might gain is less than this.
     def num_found():
-        # Other local minima are hundreds away; what a few more steps might gain is less than this.
-        return sum(above < 10.0 for seed in (74, 75) for above in _above_the_least(seed))
+        return sum(above < 10.0 for above in _above_the_least())
 
-    # Which ones do is chance: of these six from each recording, two to four.
-    assert num_found() >= 6
+    # Of six fits each of four recordings, 11 end at the least with restarts, and 3 without.
+    assert num_found() >= 3
     monkeypatch.setattr(
         segment_fit, "SEGMENT_FIT", dataclasses.replace(SEGMENT_FIT, most_restarts=0)
     )
-    assert num_found() <= 3
+    assert num_found() <= 1
 
 
-def _above_the_least(seed):
+def _above_the_least():
     """Yields how far above the least misfit of a joint with play fits from elsewhere end."""
-    case = make_case("pendulum", "one", (("hinge", "backlash"),), strength=0.72, seed=seed)
+    case = make_case("pendulum", "one", (("hinge", "backlash"),), strength=0.72, seed=74)
     model = add_effect(case.model, Backlash("hinge"))
     segments = SegmentModel(model, case.fit, DataOptions(None, 10, "uncertain", "float64"))
     (hidden,) = case.truth
