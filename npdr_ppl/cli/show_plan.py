@@ -54,10 +54,10 @@ def show_plan(found: Mapping[str, Any], out: Path) -> None:
     if len(set(starts)) == 1:
         console.print(f"Hold it at rest at {escape(starts[0])} first.", highlight=False)
     else:
-        for index, start in enumerate(starts):
-            console.print(
-                f"Hold it at rest at {escape(start)} before rollout {index}.", highlight=False
-            )
+        for start in dict.fromkeys(starts):
+            own = [str(index) for index, other in enumerate(starts) if other == start]
+            which = f"rollout{'s' * (len(own) > 1)} {', '.join(own)}"
+            console.print(f"Hold it at rest at {escape(start)} before {which}.", highlight=False)
     if found["has_stopped"]:
         console.print("The time limit ended the search; a longer --search-time may find more.")
     rollouts = f"{found['rollouts']} rollouts of " if found["rollouts"] > 1 else ""

@@ -56,8 +56,8 @@ def test_a_plan_that_does_not_suffice_says_what_would(outlook, sentence, capsys,
     assert sentence in told(capsys, tmp_path, **outlook)
 
 
-def test_starts_that_differ_are_told_one_by_one(capsys, tmp_path):
-    text = told(capsys, tmp_path, starts=({"angle": 0.0}, {"angle": 1.5}))
-    assert "Hold it at rest at angle 0 before rollout 0." in text
+def test_each_start_is_told_once(capsys, tmp_path):
+    text = told(capsys, tmp_path, starts=({"angle": 0.0}, {"angle": 1.5}, {"angle": 0.0}))
+    assert "Hold it at rest at angle 0 before rollouts 0, 2." in text
     assert "Hold it at rest at angle 1.5 before rollout 1." in text
     assert "for 2 rollouts of 5 s are in" in text
