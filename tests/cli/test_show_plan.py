@@ -60,4 +60,4 @@ def test_each_start_is_told_once(capsys, tmp_path):
     text = told(capsys, tmp_path, starts=({"angle": 0.0}, {"angle": 1.5}, {"angle": 0.0}))
     assert "Hold it at rest at angle 0 before rollouts 0, 2." in text
     assert "Hold it at rest at angle 1.5 before rollout 1." in text
-    assert "for 2 rollouts of 5 s are in" in text
+    assert "for 3 rollouts of 5 s are in" in text
