@@ -20,7 +20,8 @@ class Finding:
         probability: Probability that it is this effect, given all other effects found. Less likely
             laws that contain it and fit hardly better count, too: the recording does not tell
             their shape.
-        alternatives: Probabilities by name, of this effect and of those that could replace it.
+        alternatives: Probabilities by name, of this effect and of those that could replace it,
+            without those that count for it.
         equivalent_to: Ids of causes that the recording possibly cannot distinguish from it.
         share: Share of the misfit that it explains.
         parameters: Its parameters' estimates by short name.

@@ -74,9 +74,10 @@ def judge(
         names = ", ".join(f.effect.name for f in effects)
         return "unknown", f"The effects that were found are too small to be named: {names}."
     unclear = most_doubtful(effects, options)
-    names = " or ".join(
-        n for n, p in unclear.alternatives.items() if p >= EVIDENCE.least_probability
-    )
+    likeliest = sorted(unclear.alternatives.values(), reverse=True)
+    # At least two are named, also if each other one is unlikely.
+    least = min(EVIDENCE.least_probability, *likeliest[:2])
+    names = " or ".join(n for n, p in unclear.alternatives.items() if p >= least)
     return "ambiguous", f"The recording cannot tell which effect is missing: {names}."
 
 

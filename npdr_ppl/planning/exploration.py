@@ -34,11 +34,6 @@ class Explored:
     num_pool: int
     every: Sequence[int]
 
-    @property
-    def most_rollouts(self) -> int:
-        """Greatest number of rollouts that differ, of a plan and of as many random ones."""
-        return min(len(self.every), len(self.played.commands) - self.num_pool)
-
     def random(self, number: int) -> list[int]:
         """Returns a number of random candidates, in turn if there are fewer."""
         members = range(self.num_pool, len(self.played.commands))

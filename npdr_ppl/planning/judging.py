@@ -182,6 +182,28 @@ class Judge:
                 worst = np.maximum(worst, np.nan_to_num(ratio, nan=math.inf) - 1.0)
         return np.where(np.isfinite(played.readings).all((0, 2, 3)), worst, math.inf)
 
+    def differing_changes(self, played: Played, others: Known) -> Array:
+        """Returns how differently causes change if each gets another model, ``(n, E)``.
+
+        It is the size of a cause's change without the mean one, in standard deviations of the
+        measurements, along the segments of a candidate; NaN where a simulation fails.
+
+        Args:
+            played: The candidates.
+            others: The causes with the other models.
+        """
+        changes = []
+        for k, cause in enumerate(self.known.causes):
+            simulated = []
+            for each in (cause, others.causes[k]):
+                segments = self._segments(each, played, k, 1)
+                simulated.append(segments.simulate(each.z[None], segments.no_offsets[None])[0])
+            scale = self.scale[[self.channels.index(name) for name in segments.channel_names]]
+            changes.append(segments.whitened(simulated[0] - simulated[1], scale))
+        every = torch.stack(changes).unflatten(1, (len(played.commands), -1))
+        squares = (every - every.mean(0)).square().sum((-2, -1))
+        return (self.known.share * squares).sqrt().numpy()
+
     def shown(self, played: Played) -> "Shown":
         """Returns what candidates would show of every pair of causes, in both directions."""
         pairs = itertools.permutations(range(len(self.known.causes)), 2)

@@ -16,6 +16,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.planning.causes import Known, at_time_step, prior_of
 from npdr_ppl.planning.chances import Chance
 from npdr_ppl.planning.exploration import Explored, explore, separates
+from npdr_ppl.planning.fine_steps import in_fine_steps
 from npdr_ppl.planning.judging import Judge, Played, Shown, information_gain
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.search import Found
@@ -181,6 +182,8 @@ def plan_recording(
     _check(limits, rollouts)
     begin, known = time.monotonic(), at_time_step(known, limits.time_step)
     is_separating = separates(known)
+    if is_separating:
+        known = in_fine_steps(known, limits, seed)
     explored = explore(
         known,
         limits,
@@ -228,7 +231,7 @@ def _check(limits: Limits, rollouts: int | None) -> None:
 def _most_rollouts(explored: Explored) -> int:
     """Returns how many rollouts a plan may have that the user asked no number of."""
     in_time = int(PLANNING.most_recorded / explored.judge.limits.duration + 1e-9)
-    return max(1, min(PLANNING.most_needed, in_time, explored.most_rollouts))
+    return max(1, min(PLANNING.most_needed, in_time, len(explored.every)))
 
 
 def _separating(known: Known, explored: Explored, rollouts: int | None, most: int) -> Plan:

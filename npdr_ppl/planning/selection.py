@@ -35,11 +35,13 @@ def greedy(
         is_enough: Whether a set needs no further member.
         most: Greatest number of members.
         num_distinct: Number of members that differ from each other, as far as there are enough.
+            Further ones repeat these.
     """
     chosen: list[int] = []
     while len(chosen) < most and not (chosen and is_enough(chosen)):
         unused = [k for k in pool if k not in chosen] if len(chosen) < num_distinct else []
-        chosen.append(max(unused or pool, key=lambda k: value_of([*chosen, k])))
+        others = unused or list(dict.fromkeys(chosen))
+        chosen.append(max(others, key=lambda k: value_of([*chosen, k])))
     return chosen
 
 

@@ -37,6 +37,10 @@ class PlanningSettings:
             which squared separations shrink with its square. Plans that moved a pendulum by 1 to
             7 % of what it may were predicted to tell its frictions apart and did not
             (``benchmarks/planning.py``, seeds 2173 and 2174).
+        greatest_step_error: Greatest difference between the errors of the integration steps of
+            causes along random candidates, in standard deviations of the measurements. Those that
+            a search found had up to five times as much (``benchmarks/planning.py``, cart-pole,
+            seed 2183).
         num_draws: Number of prior draws over which information is averaged.
         num_smoothed: Number of simulated recordings from which the errors of initial states are
             estimated.
@@ -79,6 +83,7 @@ class PlanningSettings:
     least_room: float = 0.25
     margin: float = 0.05
     least_motion: float = 0.25
+    greatest_step_error: float = 0.25
     num_draws: int = 5
     num_smoothed: int = 3
     num_noises: int = 8
@@ -109,6 +114,7 @@ class PlanningSettings:
         check_range(self, 0.0, 1.0, "wanted", "least_likely", "search_share", "least_motion")
         check_range(self, 0.0, 1.0, "least_chance_gain")
         check_range(self, 0.0, 0.5, "least_room")
+        check_range(self, 0.0, 100.0, "greatest_step_error")
         check_range(self, 0.0, 1.0, "relative_noise")
         check_range(self, 0.1, math.inf, "most_seconds", "most_recorded", "prior_seconds")
         check_range(self, 0.1, math.inf, "prior_bandwidth")

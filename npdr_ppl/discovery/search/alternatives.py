@@ -54,11 +54,11 @@ class Added:
         share: Share of the explained misfit that is lost without it.
         alternatives: Probability of each alternative, itself included, given all other effects,
             by name. That of the effect includes those of its forms, which are not among them.
-        fitting: Names of the alternatives that fit equally well. The simplest law is the
-            likeliest. But a law that contains it, as bristles contain dry friction, fits equally
-            well if its further parameters have no visible influence.
-        forms: Names of those of them that contain it and fit hardly better. The recording does not
-            tell their shape.
+        fitting: Names of the laws, its forms included, that fit equally well. The simplest law is
+            the likeliest. But a law that contains it, as bristles contain dry friction, fits
+            equally well if its further parameters have no visible influence.
+        forms: Names of those in ``fitting`` that contain it and fit hardly better. The recording
+            does not tell their shape.
         is_compared: Whether it was compared with alternatives; after a time limit it may not be.
     """
 

@@ -1,0 +1,49 @@
+"""Integration steps that are fine enough for a plan.
+
+A command that is late by a part of a step changes within it, a late measurement does not. In
+coarse steps the two differ by the error of the steps, and a search would find the motion where
+this error is greatest.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from npdr_ppl.language.handlers import with_finer_steps
+from npdr_ppl.planning.causes import Known
+from npdr_ppl.planning.excitations import Excitations
+from npdr_ppl.planning.judging import Judge
+from npdr_ppl.planning.limits import Limits
+from npdr_ppl.planning.search import played_by
+from npdr_ppl.planning.settings import PLANNING
+
+__all__ = ["in_fine_steps"]
+
+
+def in_fine_steps(known: Known, limits: Limits, seed: int) -> Known:
+    """Returns causes in steps whose errors hardly differ between them, or in the finest ones.
+
+    Args:
+        known: The causes, at the time step of the limits.
+        limits: What the robot may do.
+        seed: Seed of the candidates.
+    """
+    excitations = Excitations(limits, np.random.default_rng(seed))
+    candidates = excitations.random(PLANNING.num_smoothed)
+    while (finer := _in_finer_steps(known)) is not None:
+        judge = Judge(known, limits, seed)
+        played = played_by(excitations, judge, candidates)
+        errors = judge.differing_changes(played, finer)
+        # Candidates that leave the limits may diverge, and say nothing.
+        if not bool((errors > PLANNING.greatest_step_error).any()):
+            return known
+        known = finer
+    return known
+
+
+def _in_finer_steps(known: Known) -> Known | None:
+    """Returns the causes in their next finer steps; ``None`` if one has none."""
+    if any(cause.simulator.with_finer_steps() is None for cause in known.causes):
+        return None
+    causes = (replace(cause, model=with_finer_steps(cause.model)) for cause in known.causes)
+    return replace(known, causes=tuple(causes))
