@@ -75,7 +75,7 @@ def judge(
         return "unknown", f"The effects that were found are too small to be named: {names}."
     unclear = most_doubtful(effects, options)
     likeliest = sorted(unclear.alternatives.values(), reverse=True)
-    # At least two are named, also if each other one is unlikely.
+    # At least two are named, even if all others are unlikely.
     least = min(EVIDENCE.least_probability, *likeliest[:2])
     names = " or ".join(n for n, p in unclear.alternatives.items() if p >= least)
     return "ambiguous", f"The recording cannot tell which effect is missing: {names}."

@@ -1,7 +1,7 @@
 """Integration steps that are fine enough for a plan.
 
-A command that is late by a part of a step changes within it, a late measurement does not. In
-coarse steps the two differ by the error of the steps, and a search would find the motion where
+A late command changes in the middle of a step, late measurements do not change the step. In coarse
+steps, such causes also differ by the error of the steps, and a search would find the motion where
 this error is greatest.
 """
 
@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.handlers import with_finer_steps
 from npdr_ppl.planning.causes import Known
 from npdr_ppl.planning.excitations import Excitations
 from npdr_ppl.planning.judging import Judge
 from npdr_ppl.planning.limits import Limits
-from npdr_ppl.planning.search import played_by
+from npdr_ppl.planning.search import within_limits
 from npdr_ppl.planning.settings import PLANNING
 
 __all__ = ["in_fine_steps"]
@@ -23,19 +24,27 @@ __all__ = ["in_fine_steps"]
 def in_fine_steps(known: Known, limits: Limits, seed: int) -> Known:
     """Returns causes in steps whose errors hardly differ between them, or in the finest ones.
 
+    Their parameters remain those of the steps in which they were fitted. The steps are kept if no
+    random candidate keeps the limits, or if finer ones cannot be simulated.
+
     Args:
         known: The causes, at the time step of the limits.
         limits: What the robot may do.
         seed: Seed of the candidates.
     """
     excitations = Excitations(limits, np.random.default_rng(seed))
-    candidates = excitations.random(PLANNING.num_smoothed)
+    made = excitations.random(PLANNING.batch)
     while (finer := _in_finer_steps(known)) is not None:
         judge = Judge(known, limits, seed)
-        played = played_by(excitations, judge, candidates)
-        errors = judge.differing_changes(played, finer)
-        # Candidates that leave the limits may diverge, and say nothing.
-        if not bool((errors > PLANNING.greatest_step_error).any()):
+        kept, played = within_limits(excitations, judge, made)
+        few = range(min(len(kept), PLANNING.num_smoothed))
+        if not few:
+            return known
+        try:
+            changes = judge.differing_changes(played.chosen(few), finer)
+        except NpdrError:
+            return known
+        if not bool((changes > PLANNING.greatest_step_error).any()):
             return known
         known = finer
     return known

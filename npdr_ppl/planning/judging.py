@@ -186,7 +186,7 @@ class Judge:
         """Returns how differently causes change if each gets another model, ``(n, E)``.
 
         It is the size of a cause's change without the mean one, in standard deviations of the
-        measurements, along the segments of a candidate; NaN where a simulation fails.
+        measurements, along the segments of a candidate; NaN where the other model fails.
 
         Args:
             played: The candidates.

@@ -183,7 +183,10 @@ def plan_recording(
     begin, known = time.monotonic(), at_time_step(known, limits.time_step)
     is_separating = separates(known)
     if is_separating:
+        progress(None, "compare with finer integration steps")
         known = in_fine_steps(known, limits, seed)
+    time_limit = max(0.0, time_limit - (time.monotonic() - begin))
+    begin = time.monotonic()
     explored = explore(
         known,
         limits,

@@ -12,7 +12,7 @@ from npdr_ppl.planning.judging import Judge, Played
 from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.progress import Step
 
-__all__ = ["Found", "played_by", "search_excitations"]
+__all__ = ["Found", "played_by", "search_excitations", "within_limits"]
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def search_excitations(
             if is_first
             else _refined(excitations, ranked.elites, step, num)
         )
-        candidates, played = _within_limits(excitations, judge, made)
+        candidates, played = within_limits(excitations, judge, made)
         values = value_of(played) if candidates else np.zeros(0)
         if not ranked.add(candidates, values, are_random=is_first) and not is_first:
             step = max(PLANNING.least_step, PLANNING.shrink * step)
@@ -123,7 +123,7 @@ def _refined(
     return result
 
 
-def _within_limits(
+def within_limits(
     excitations: Excitations, judge: Judge, made: list[Candidate]
 ) -> tuple[list[Candidate], Played]:
     """Returns the first candidates, at most a batch, whose simulations keep the limits.

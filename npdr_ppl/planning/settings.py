@@ -37,10 +37,10 @@ class PlanningSettings:
             which squared separations shrink with its square. Plans that moved a pendulum by 1 to
             7 % of what it may were predicted to tell its frictions apart and did not
             (``benchmarks/planning.py``, seeds 2173 and 2174).
-        greatest_step_error: Greatest difference between the errors of the integration steps of
-            causes along random candidates, in standard deviations of the measurements. Those that
-            a search found had up to five times as much (``benchmarks/planning.py``, cart-pole,
-            seed 2183).
+        greatest_step_error: Greatest deviation of the integration error of one cause from the mean
+            of all, along random candidates, in standard deviations of the measurements. Two causes
+            can differ by twice as much. Candidates that a search had found deviated by up to five
+            times as much as random ones (``benchmarks/planning.py``, cart-pole, seed 2183).
         num_draws: Number of prior draws over which information is averaged.
         num_smoothed: Number of simulated recordings from which the errors of initial states are
             estimated.

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.planning import fine_steps
 from npdr_ppl.planning.fine_steps import in_fine_steps
+from npdr_ppl.planning.judging import Judge
 from npdr_ppl.planning.settings import PLANNING
 
 
@@ -26,3 +28,14 @@ def test_steps_are_refined_until_their_errors_are_small_or_there_are_no_finer_on
     finest = in_fine_steps(known, limits, 0)
     assert num_refined(finest) == {n + 1 for n in num_refined(known)}
     assert in_fine_steps(finest, limits, 0) is finest
+
+
+@pytest.mark.slow
+def test_steps_are_kept_where_no_candidate_can_be_simulated(surviving, monkeypatch):
+    known, limits = surviving
+    monkeypatch.setattr(Judge, "_simulated", fails)
+    assert in_fine_steps(known, limits, 0) is known
+
+
+def fails(judge, box, inputs):
+    return np.full((*inputs.actions.shape[:2], len(judge.channels)), np.nan)
