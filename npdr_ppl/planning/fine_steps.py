@@ -1,8 +1,9 @@
 """Integration steps that are fine enough for a plan.
 
-A late command changes in the middle of a step, late measurements do not change the step. In coarse
-steps, such causes also differ by the error of the steps, and a search would find the motion where
-this error is greatest.
+A command that is late by half a step changes in the middle of one, which coarse steps simulate
+with an error. Late measurements leave the commands at the ends of steps, without this error. So a
+search would find the motion where the error is greatest, and would take it for a difference of
+the causes.
 """
 
 from dataclasses import replace

@@ -13,7 +13,7 @@ parameters of one cause is ½ log det(P⁻¹ (Jᵀ C⁻¹ J + P)).
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.planning.causes import Cause, Known, prior_of
 from npdr_ppl.planning.limits import Limits
+from npdr_ppl.planning.separations import Shown, apart, information_gain
 from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.preparation.data_options import DataOptions, default_segment_length
 from npdr_ppl.preparation.initial_states import InitialStates
@@ -34,7 +35,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.states import estimate_states
 
-__all__ = ["Judge", "Played", "Shown", "information_gain"]
+__all__ = ["Judge", "Played"]
 
 Array = NDArray[np.float64]
 
@@ -204,7 +205,7 @@ class Judge:
         squares = (every - every.mean(0)).square().sum((-2, -1))
         return (self.known.share * squares).sqrt().numpy()
 
-    def shown(self, played: Played) -> "Shown":
+    def shown(self, played: Played) -> Shown:
         """Returns what candidates would show of every pair of causes, in both directions."""
         pairs = itertools.permutations(range(len(self.known.causes)), 2)
         return Shown(
@@ -265,7 +266,7 @@ class Judge:
             products = self._blocks(played, a, b, every=every)
         except NpdrError:
             return np.full((1, len(played.commands)), -math.inf)
-        return _apart(products, self.known.causes[b].precision, every).mT.numpy()
+        return apart(products, self.known.causes[b].precision, every).mT.numpy()
 
     def _blocks(self, played: Played, a: int, b: int, *, every: int) -> Tensor:
         """Returns the products by block of segments, ``(E, blocks, d + 1, d + 1)``."""
@@ -411,54 +412,6 @@ class Judge:
             return np.full((*inputs.actions.shape[:2], len(self.channels)), math.nan)
         simulated = simulated.reshape(inputs.num_segments, inputs.num_steps, len(names)).double()
         return simulated[..., [names.index(name) for name in self.channels]].numpy()
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What candidates would show of every pair of causes, several candidates together included.
-
-    Attributes:
-        products: (J r)ᵀ C⁻¹ (J r) by pair (a, b) and block, ``(E, blocks, d + 1, d + 1)``.
-        precisions: Precision of each cause's coordinates after the recordings so far.
-    """
-
-    products: Mapping[tuple[int, int], Tensor]
-    precisions: Sequence[Tensor]
-
-    def squares(self, chosen: Sequence[int]) -> dict[tuple[int, int], Array]:
-        """Returns the squared separations along several candidates together, by pair and block.
-
-        One set of parameters must fit all of them. A candidate may be chosen several times.
-        """
-        return {
-            (a, b): _apart(found[list(chosen)].flatten(0, 1)[None], self.precisions[b])[0].numpy()
-            for (a, b), found in self.products.items()
-        }
-
-
-def _apart(products: Tensor, precision: Tensor, every: int = 1) -> Tensor:
-    """Returns the squared separations after the refit, ``(E, blocks)``.
-
-    Args:
-        products: Products by block, ``(E, blocks, d + 1, d + 1)``.
-        precision: Precision of the coordinates that are refitted, ``(d, d)``.
-        every: Number of segments for which each one stands.
-    """
-    whole = every * products.sum(1)
-    information, score = whole[:, :-1, :-1], whole[:, :-1, -1]
-    shift = torch.linalg.solve(information + precision, score)
-    # The parameters move, and the difference r becomes r − J shift.
-    moved = torch.cat((-shift, torch.ones_like(shift[:, :1])), dim=-1)
-    left = torch.einsum("ei,esij,ej->es", moved, products, moved)
-    # Moved parameters fit the recordings so far less well, nearly evenly.
-    before = torch.einsum("ei,ij,ej->e", shift, precision, shift)
-    left = left + before[:, None] / (every * left.shape[1])
-    return left.clamp_min(0.0).nan_to_num(-math.inf)
-
-
-def information_gain(before: Tensor, after: Tensor) -> Tensor:
-    """Returns ½ log det(P⁻¹ P'), in nats, ``(E,)``, of precisions P and P', ``(E, d, d)``."""
-    return 0.5 * (torch.linalg.slogdet(after).logabsdet - torch.linalg.slogdet(before).logabsdet)
 
 
 def _box(cause: Cause, time_step: float) -> SimulatorBlackBox:

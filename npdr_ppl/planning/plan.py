@@ -17,10 +17,11 @@ from npdr_ppl.planning.causes import Known, at_time_step, prior_of
 from npdr_ppl.planning.chances import Chance
 from npdr_ppl.planning.exploration import Explored, explore, separates
 from npdr_ppl.planning.fine_steps import in_fine_steps
-from npdr_ppl.planning.judging import Judge, Played, Shown, information_gain
+from npdr_ppl.planning.judging import Judge, Played
 from npdr_ppl.planning.limits import Limits
 from npdr_ppl.planning.search import Found
 from npdr_ppl.planning.selection import chance_of, rollouts_that_inform, rollouts_that_separate
+from npdr_ppl.planning.separations import Shown, information_gain
 from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.planning.wider import Wider, chances_with_wider_limits
 from npdr_ppl.progress import Step

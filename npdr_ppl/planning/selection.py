@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.planning.causes import Known
 from npdr_ppl.planning.chances import Chance, chance_of_naming
-from npdr_ppl.planning.judging import Shown, information_gain
+from npdr_ppl.planning.separations import Shown, information_gain
 from npdr_ppl.planning.settings import PLANNING
 
 __all__ = ["certainty", "chance_of", "greedy", "rollouts_that_inform", "rollouts_that_separate"]

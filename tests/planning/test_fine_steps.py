@@ -1,4 +1,4 @@
-"""Causes are told apart in steps whose errors do not do so."""
+"""Plans take finer integration steps where the errors of coarse ones differ between causes."""
 
 from dataclasses import replace
 

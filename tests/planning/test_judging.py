@@ -8,8 +8,9 @@ import torch
 
 from npdr_ppl.planning.causes import Known
 from npdr_ppl.planning.excitations import Excitations
-from npdr_ppl.planning.judging import Judge, information_gain
+from npdr_ppl.planning.judging import Judge
 from npdr_ppl.planning.limits import ChannelLimits
+from npdr_ppl.planning.separations import information_gain
 from npdr_ppl.planning.settings import PLANNING
 
 
