@@ -118,7 +118,7 @@ class Searcher(OriginalModel):
         return self._revised(current, rounds, max_effects)
 
     def _refines_steps(self, current: Hypothesis, now: Round) -> bool:
-        """Takes finer integration steps if they are too coarse for a model or one of its rivals.
+        """Takes finer integration steps if the present ones are too coarse for a model or a rival.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
         measurement does not: in coarse steps, the wrong one of the two can fit better.
