@@ -261,25 +261,31 @@ def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
 
 
 def _separation_of_each(case: Case) -> float:
-    """Returns the smaller distance between the recording and a model with one of two effects.
+    """Returns the smaller distance from the model with both effects to one without one of them.
 
-    The model's parameters and those of the effect are refitted.
+    Each model is fitted to the same recording. With a recording in which nothing is hidden, more
+    would differ than what one effect leaves of the other.
+
+    Raises:
+        DataError: The model with both effects cannot be simulated.
     """
-    options = npdr.DiscoveryOptions()
-    searcher = Searcher(case.model, case.fit, options, data_options=_segments(case))
-    base, null = searcher.fit_base(), _quiet(case.rig, case.seed)
+    searcher = Searcher(
+        case.model, case.fit, npdr.DiscoveryOptions(), data_options=_segments(case)
+    )
+    base = searcher.fit_base()
     known = {effect.name: effect for effect in candidate_effects(base.simulator)}
-    distances = []
-    for hidden in case.truth:
-        start = {name: torch.tensor(value).double() for name, value in hidden.sites.items()}
-        effect = as_hidden(known[hidden.name], hidden)
-        found = searcher.trials.refitted(base, (effect,), start=start)
-        left = math.inf
-        if found is not None:
-            scale = null.fit.scale
-            left = 2.0 * float((found.losses(scale) - null.losses(scale)).sum())
-        distances.append(max(left, 0.0) ** 0.5)
-    return min(distances)
+    start = {name: torch.tensor(v).double() for h in case.truth for name, v in h.sites.items()}
+    effects = tuple(as_hidden(known[hidden.name], hidden) for hidden in case.truth)
+    both = searcher.trials.refitted(base, effects, start=start)
+    if both is None:
+        raise DataError("The model with both effects cannot be simulated.")
+    scale, least = both.fit.scale, math.inf
+    for effect in both.effects:
+        alone = searcher.trials.without(both, effect)
+        if alone is not None:
+            left = 2.0 * float((alone.losses(scale) - both.losses(scale)).sum())
+            least = min(least, max(left, 0.0))
+    return math.sqrt(least)
 
 
 @functools.lru_cache(maxsize=1)

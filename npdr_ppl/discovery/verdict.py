@@ -36,11 +36,9 @@ def judge(
             return "none", "This recording shows no missing effect."
         return "unknown", "Simulation and recording disagree, and no effect explains it."
     left = search.rounds[-1].alarm
-    # Not corrected for the number of rounds: this test only reports a remainder.
-    is_detected = left.p_value <= options.false_alarm_rate
     # The alarm allows for every kind of noise, so it misses a remainder in only a few segments.
     is_certain = 0.5 * search.final.share * left.gain > TRIALS.certain_evidence
-    if (is_detected and unexplained > VERDICT.most_unexplained) or (
+    if (left.fired and unexplained > VERDICT.most_unexplained) or (
         is_certain and unexplained > VERDICT.most_undetected
     ):
         return "unknown", (

@@ -57,7 +57,6 @@ def sound_alarm(
     *,
     false_alarm_rate: float,
     seed: int,
-    num_looks: int = 0,
 ) -> tuple[Alarm, list[Screened]]:
     """Tests a fitted hypothesis against every candidate and every generic law at once.
 
@@ -72,7 +71,6 @@ def sound_alarm(
         sensors: The simulator's sensors.
         false_alarm_rate: Probability that an alarm fires although nothing is missing.
         seed: Seed of the simulated noise.
-        num_looks: How often the recording was tested before.
 
     Returns:
         The alarm, and the candidates that explain a part of the misfit, the best first.
@@ -115,19 +113,17 @@ def sound_alarm(
     # Some segments stand out by chance: their gain is used only where that is unlikely.
     unlikely = [moment for moment in moments if values[moment.name] <= false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in unlikely}
-    # Every added effect means one more test of the same recording.
-    limit = false_alarm_rate / (1 + num_looks)
     if not values:
-        return Alarm(1.0, False, "", 0.0, {}, limit), ranking
+        return Alarm(1.0, False, "", 0.0, {}, false_alarm_rate), ranking
     p_value = min(values.values())
     strongest = [name for name, p in values.items() if p == p_value]
     alarm = Alarm(
         p_value,
-        p_value <= limit,
+        p_value <= false_alarm_rate,
         min(strongest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
         values,
-        limit,
+        false_alarm_rate,
     )
     return alarm, ranking
 

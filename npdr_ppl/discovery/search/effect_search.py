@@ -91,6 +91,8 @@ class Searcher(OriginalModel):
         """
         current, now = first.hypothesis, first
         rounds = [first]
+        # Each round's test is made only after that of the round before was positive. In such a
+        # fixed order, none needs a correction for their number (Marcus, Peritz & Gabriel 1976).
         while num_counted(current.effects) < max_effects and is_something_left(first, now):
             # At least the likeliest candidates are fitted, so that there is an answer.
             if len(rounds) > 1 and self._deadline.stops():

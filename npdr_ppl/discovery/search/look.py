@@ -55,7 +55,6 @@ def look(
         hypothesis.simulator.sensors,
         false_alarm_rate=options.false_alarm_rate,
         seed=seed,
-        num_looks=len(hypothesis.effects),
     )
     separation = separation_matrix(projection, ranking[: SEARCH.num_leading])
     pairs = ranked_pairs(projection, ranking[: SEARCH.num_paired])
