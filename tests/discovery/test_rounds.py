@@ -29,10 +29,10 @@ def look(hypothesis, *gains, p_value=0.0):
     return SimpleNamespace(
         hypothesis=hypothesis,
         alarm=SimpleNamespace(
-            fired=True,
             gain=max(gains, default=0.0),
             p_values=dict.fromkeys(names, p_value),
             limit=0.01,
+            fired=True,
         ),
         ranking=[SimpleNamespace(name=n, gain=g) for n, g in zip(names, gains, strict=True)],
         shares=dict(zip(names, torch.eye(len(gains), dtype=torch.float64), strict=True)),

@@ -39,8 +39,8 @@ def test_a_certain_effect_that_explains_everything_is_named(judge, drag):
 
 
 def test_without_effects_only_the_alarm_decides(judge):
-    assert judge(effects=[], fired=False)[0] == "none"
-    verdict, reason = judge(effects=[], fired=True)
+    assert judge(effects=[], p_value=0.5)[0] == "none"
+    verdict, reason = judge(effects=[], p_value=1e-3)
     assert verdict == "unknown" and "no effect explains it" in reason
 
 

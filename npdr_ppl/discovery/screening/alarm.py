@@ -34,7 +34,6 @@ class Alarm:
 
     Attributes:
         p_value: Probability of a disagreement this large by chance, corrected for the search.
-        fired: Whether it is low enough for the requested false-alarm rate.
         strongest: Name of the effect, or of the law outside the catalogue, with the least p-value.
         gain: Greatest reduction of the misfit by one candidate or law.
         p_values: P-value of each candidate and law, by name.
@@ -42,11 +41,15 @@ class Alarm:
     """
 
     p_value: float
-    fired: bool
     strongest: str
     gain: float
     p_values: dict[str, float]
     limit: float
+
+    @property
+    def fired(self) -> bool:
+        """Whether the p-value is low enough for the requested false-alarm rate."""
+        return self.p_value <= self.limit
 
 
 def sound_alarm(
@@ -114,12 +117,11 @@ def sound_alarm(
     unlikely = [moment for moment in moments if values[moment.name] <= false_alarm_rate]
     gains |= {moment.name: moment.gain for moment in unlikely}
     if not values:
-        return Alarm(1.0, False, "", 0.0, {}, false_alarm_rate), ranking
+        return Alarm(1.0, "", 0.0, {}, false_alarm_rate), ranking
     p_value = min(values.values())
     strongest = [name for name, p in values.items() if p == p_value]
     alarm = Alarm(
         p_value,
-        p_value <= false_alarm_rate,
         min(strongest, key=lambda name: (-gains.get(name, 0.0), name)),
         max(gains.values(), default=0.0),
         values,
