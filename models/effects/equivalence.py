@@ -11,6 +11,7 @@ __all__ = [
     "LATENCY",
     "OVERALL_SCALE",
     "POSITION_SCALE",
+    "UNSEEN_TURN",
     "VELOCITY_FEEDBACK",
 ]
 
@@ -54,6 +55,11 @@ COMMAND_LIMIT = EquivalenceClass(
     ("supply_sag", "saturation"),
     "commands near the limit for a good part of the time",
 )
+UNSEEN_TURN = EquivalenceClass(
+    "unseen turn",
+    ("base_compliance", "an elastic gear behind the motor's encoder"),
+    "a sensor on the link, or one on the base",
+)
 
 EQUIVALENCE_CLASSES: tuple[EquivalenceClass, ...] = (
     VELOCITY_FEEDBACK,
@@ -64,4 +70,5 @@ EQUIVALENCE_CLASSES: tuple[EquivalenceClass, ...] = (
     OVERALL_SCALE,
     POSITION_SCALE,
     COMMAND_LIMIT,
+    UNSEEN_TURN,
 )

@@ -48,6 +48,7 @@ BUILT_IN = {
     "hardening_spring": f"{_HOME}.forces:HardeningSpring",
     "joint_elasticity": f"{_HOME}.transmission:JointElasticity",
     "backlash": f"{_HOME}.transmission:Backlash",
+    "base_compliance": f"{_HOME}.carriers:BaseCompliance",
     "payload": f"{_HOME}.surroundings:Payload",
     "unbalance": f"{_HOME}.forces:Unbalance",
     "tilt": f"{_HOME}.surroundings:Tilt",

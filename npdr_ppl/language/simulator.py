@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
-from npdr_ppl.language.effects import Effect, ParameterEffect, ServoEffect
+from npdr_ppl.language.effects import ComplianceEffect, Effect, ParameterEffect, ServoEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import InverseDynamics
 
@@ -41,6 +41,7 @@ class Simulator(ABC):
         uses_threads: Whether a batch is simulated on several threads, so that further processes
             would save no time.
         takes_servo_effects: Whether effects inside servos can be attached.
+        takes_compliance: Whether joints can have carriers that yield.
         effects: The effects attached, in the order of attachment.
         inverse_dynamics: The equations of motion in the form for linear regression; ``None`` if
             not declared.
@@ -56,6 +57,7 @@ class Simulator(ABC):
     is_differentiable: bool = False
     uses_threads: bool = False
     takes_servo_effects: bool = False
+    takes_compliance: bool = False
     effects: tuple[Effect, ...] = ()
     inverse_dynamics: InverseDynamics | None = None
 
@@ -103,6 +105,8 @@ class Simulator(ABC):
                 raise ModelError(
                     f"{self.name} cannot apply {effect.id}, an effect inside a servo."
                 )
+            if isinstance(effect, ComplianceEffect) and not self.takes_compliance:
+                raise ModelError(f"{self.name} cannot apply {effect.id}, which adds a joint.")
             if not effect.suits(port):
                 raise ModelError(
                     f"{effect.id} makes no sense at the port {port.name!r} of {self.name}, "

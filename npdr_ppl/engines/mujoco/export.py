@@ -2,12 +2,10 @@
 
 import copy
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-from uuid import uuid4
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,19 +13,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.common.robot_files import RobotFiles, is_urdf, read_robot, references
-from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
+from npdr_ppl.engines.common.robot_files import is_urdf, read_robot, references
 from npdr_ppl.engines.mujoco.callbacks.python_file import CallbackFile, callback_file
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mjcf_edits import Edits, array_of
-from npdr_ppl.engines.mujoco.mjcf_text import MjcfText, flattened
+from npdr_ppl.engines.mujoco.mjcf_files import mjcf_text, reloaded
+from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.engines.mujoco.parameters import Assignments
-from npdr_ppl.engines.mujoco.urdf_files import as_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect
 
-__all__ = ["ExportedMjcf", "export_mjcf", "module_name", "reloaded", "written"]
+__all__ = ["ExportedMjcf", "export_mjcf", "module_name", "written"]
 
 Array = NDArray[np.float64]
 
@@ -83,7 +80,7 @@ def export_mjcf(
     time_step = time_step or simulator.time_step
     step = time_step / simulator.num_substeps(time_step)
     files = read_robot(simulator.file)
-    before = _text_of(simulator.file, files)
+    before = mjcf_text(simulator.file, files)
     # Of a URDF file, meshes that were not found are left out.
     trees = [ElementTree.fromstring(before)] if is_urdf(files) else files.trees.values()
     needs_folder = any(True for tree in trees for _ in references(tree))
@@ -209,33 +206,6 @@ def _new_text(
     text = edits.text.result()
     _check(text, original, model)
     return text
-
-
-def reloaded(text: str, ending: str, folder: Path | None) -> Any:
-    """Returns the model of a file that was written, as the engine reads it.
-
-    Args:
-        text: The file's text.
-        ending: ``".xml"`` or ``".urdf"``.
-        folder: Folder that has the meshes; ``None`` if there are none.
-
-    Raises:
-        ModelError: The engine cannot read it.
-    """
-    with tempfile.TemporaryDirectory() as own:
-        path = (folder or Path(own)) / f".npdr-{uuid4().hex}{ending}"
-        try:
-            path.write_text(text, encoding="utf-8")
-            return load_mjcf(path)
-        except ModelError as error:
-            raise ModelError(str(error).replace(str(path), "The new text")) from None
-        finally:
-            path.unlink(missing_ok=True)
-
-
-def _text_of(file: Path, files: RobotFiles) -> str:
-    """Returns the MJCF text of a robot's file; of a URDF file, what MuJoCo makes of it."""
-    return as_mjcf(file) if is_urdf(files) else flattened(files).decode()
 
 
 def written(model: Any, assignments: Assignments) -> Any:

@@ -1,9 +1,11 @@
 """An MJCF file as a mechanism: channels, parameters and ports, and batches of simulations."""
 
+import copy
 import importlib
 import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Self
@@ -32,11 +34,17 @@ from npdr_ppl.engines.mujoco.environment import environment_ports, with_environm
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
 from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
-from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
+from npdr_ppl.engines.mujoco.ports import ForcePort, derive_ports, driven_dofs, force_ports
+from npdr_ppl.engines.mujoco.second_joints import (
+    SecondJoint,
+    WithSecondJoints,
+    with_second_joints,
+)
 from npdr_ppl.engines.mujoco.servos import check_servo, with_servos
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.language.effects import (
+    ComplianceEffect,
     Effect,
     EnvironmentEffect,
     ForceEffect,
@@ -48,6 +56,9 @@ from npdr_ppl.registry import hint
 __all__ = ["MujocoMechanism"]
 
 logger = logging.getLogger(__name__)
+
+_LEAST_TIME_CONSTANT = 2.0
+"""Least time constant of a carrier alone, in engine steps: half of what explicit steps bear."""
 
 
 class MujocoMechanism(ClosedLoopSimulator):
@@ -65,6 +76,9 @@ class MujocoMechanism(ClosedLoopSimulator):
 
     uses_threads = True
     takes_servo_effects = True
+    takes_compliance = True
+    # The simulator without second joints, once effects have added some.
+    rigid: Self | None = None
 
     def __init__(
         self,
@@ -89,6 +103,10 @@ class MujocoMechanism(ClosedLoopSimulator):
         self._source = recorded_mjcf(source)
         self.file = Path(source) if isinstance(source, str | PathLike) else None
         self.prepared_models: dict[tuple[object, ...], Any] = {}
+        # Models in which some joints have a second one, by the numbers of these joints.
+        self.with_second: dict[tuple[int, ...], WithSecondJoints] = {}
+        # The second joint of each port that has one.
+        self.second_joints: dict[str, SecondJoint] = {}
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
         self.substeps, self.num_threads = substeps, num_threads
@@ -98,7 +116,8 @@ class MujocoMechanism(ClosedLoopSimulator):
         self._declare_channels(states, sensors, units or {}, bounds or {})
         taken = [channel.name for channel in (*self.states, *self.sensors, *self.actions)]
         self.force_ports = force_ports(self.model, taken)
-        self.bindings = Bindings(self.model, parameters or {}, derived or {})
+        self._bound = parameters or {}, derived or {}
+        self.bindings = Bindings(self.model, *self._bound)
         self.parameters = self.bindings.parameters
         taken += [*self.joints, *(parameter.name for parameter in self.parameters)]
         self._environment = environment_ports(self.model, driven_dofs(self.model), taken)
@@ -185,6 +204,48 @@ class MujocoMechanism(ClosedLoopSimulator):
         changed = super().with_effects(*effects)
         for _, effect, actuator in changed.servo_effects:
             check_servo(self.model, actuator, effect.id)
+        return changed.with_carriers()
+
+    def with_carriers(self) -> Self:
+        """Returns a copy whose joints have the second ones that its effects need."""
+        yielding = {e.port for e in self.effects if isinstance(e, ComplianceEffect)}
+        if yielding == self.second_joints.keys():
+            return self
+        rigid = self.rigid or self
+        chosen = [p for p in rigid.force_ports if p.port.name in yielding]
+        key = tuple(port.joint for port in chosen)
+        if key not in rigid.with_second:
+            rigid.with_second[key] = with_second_joints(rigid.file, rigid.model, key)
+        found = rigid.with_second[key]
+        changed = copy.copy(self)
+        changed.__dict__.pop("inverse_dynamics", None)  # a cached property of the old model
+        changed.rigid, changed.prepared_models = rigid, {}
+        changed.model = copy.copy(found.model)
+        changed.model.opt.integrator = rigid.model.opt.integrator
+        changed.second_joints = {
+            port.port.name: second for port, second in zip(chosen, found.seconds, strict=True)
+        }
+
+        def moved(component: Component) -> Component:
+            table = found.velocities if component.is_velocity else found.positions
+            return replace(component, address=int(table[component.address]))
+
+        changed.components = tuple(map(moved, rigid.components))
+        changed.readings = tuple(
+            moved(r) if isinstance(r, Component) else r for r in rigid.readings
+        )
+        changed.force_ports = tuple(
+            ForcePort(
+                port.port,
+                int(found.joints[port.joint]),
+                int(found.positions[port.position]),
+                int(found.velocities[port.velocity]),
+            )
+            for port in rigid.force_ports
+        )
+        changed.bindings = Bindings(changed.model, *self._bound)
+        changed.initial_positions = np.zeros(changed.model.nq)
+        changed.initial_positions[found.positions] = rigid.initial_positions
         return changed
 
     @property
@@ -219,6 +280,16 @@ class MujocoMechanism(ClosedLoopSimulator):
         assignments = with_servos(self.model, commands, self.effects, own, assignments)
         by_port = {port.port.name: port for port in self.force_ports}
         for effect, values in zip(self.effects, own, strict=True):
+            if isinstance(effect, ComplianceEffect):
+                second, carrier = self.second_joints[effect.port], effect.carrier(values)
+                least = _LEAST_TIME_CONSTANT * self.time_step / self.num_substeps(self.time_step)
+                assignments |= {
+                    ("jnt_stiffness", second.joint): carrier.stiffness,
+                    ("dof_damping", second.velocity): carrier.damping,
+                    ("dof_armature", second.velocity): torch.maximum(
+                        carrier.inertia, least**2 * carrier.stiffness
+                    ),
+                }
             if isinstance(effect, ForceEffect) and self.is_native(effect):
                 port = by_port[effect.port]
                 assignments |= native_law(self.model, port, effect, values, assignments)
@@ -226,7 +297,7 @@ class MujocoMechanism(ClosedLoopSimulator):
 
     def is_native(self, effect: Effect) -> bool:
         """Returns whether the engine's model has the effect, so that no further force acts."""
-        if isinstance(effect, EnvironmentEffect):
+        if isinstance(effect, EnvironmentEffect | ComplianceEffect):
             return True
         ports = [p for p in self.force_ports if p.port.name == effect.port]
         if not isinstance(effect, ForceEffect) or not ports:

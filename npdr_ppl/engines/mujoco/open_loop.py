@@ -145,6 +145,9 @@ class _Replay:
             )
             state = state._replace(servo_memory=servo_memory)
             controls = self._controls(chain, state, tables, records, first, last)
+            if self.simulator.second_joints:
+                chain.settle(torch.from_numpy(controls[:, 0, 0]).unbind(-1))
+                chain.begin()
             if chain.has_forces:
                 return self._step_by_step(chain, state, tables, controls)
             true = run_all_steps(batch, controls, chain.substeps, self.simulator.readings)

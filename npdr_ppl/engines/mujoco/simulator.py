@@ -101,6 +101,8 @@ class MujocoSimulator(MujocoMechanism):
         takes up to four times as many. Where these would be unstable, too, it takes four times as
         many of the file's own integrator, and the second call returns ``None``.
         """
+        if self.rigid is not None:
+            return self._on(self.rigid.with_finer_steps())
         mujoco: Any = importlib.import_module("mujoco")
         rk4 = mujoco.mjtIntegrator.mjINT_RK4
         is_fourth = self.model.opt.integrator == rk4
@@ -125,11 +127,21 @@ class MujocoSimulator(MujocoMechanism):
 
     def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
         """Returns a copy with the file's own steps; ``None`` if these are its steps."""
+        if self.rigid is not None:
+            return self._on(self.rigid.with_coarser_steps(num_simulations))
         if self.unrefined is None:
             return None
         changed = copy.copy(self.unrefined)
         changed.effects = self.effects
         return changed
+
+    def _on(self, rigid: Self | None) -> Self | None:
+        """Returns a simulator without second joints with this one's effects."""
+        if rigid is None:
+            return None
+        changed = copy.copy(rigid)
+        changed.effects = self.effects
+        return changed.with_carriers()
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions in float64; see :meth:`Simulator.simulate`."""
@@ -152,6 +164,7 @@ class MujocoSimulator(MujocoMechanism):
             batch, tables = self.make_batch(flat, shape.numel(), step, middle)
             stepper = MujocoStepper(self, batch, step, self.histories(flat, step))
             stepper.place(states)
+            stepper.settle()
             stepper.begin()
             body = LoopBody(stepper, policy, request.reward)
             loop = begin(body, states, tables, constants)

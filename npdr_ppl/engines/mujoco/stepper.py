@@ -22,6 +22,9 @@ __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 ACCELERATION_STAGE = 3
 """Stage of sensors that depend on accelerations."""
 
+_IMMOVABLE = 1e12
+"""Inertia that no force moves, in kg m² or kg."""
+
 
 class MujocoStepper(EffectChain):
     """Advances a batch whose engine stores the physical state.
@@ -106,6 +109,31 @@ class MujocoStepper(EffectChain):
     def place(self, components: tuple[Tensor, ...]) -> None:
         """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
         place_states(self.simulator, self._batch, components)
+
+    def settle(self, actions: Components | None = None) -> None:
+        """Places second joints where their springs balance the forces on them.
+
+        Args:
+            actions: The first commands after all effects; without them, only weights act.
+        """
+        seconds = list(self.simulator.second_joints.values())
+        if not seconds:
+            return
+        at = [second.velocity for second in seconds]
+        springs = self._batch.expand("jnt_stiffness")[:, [second.joint for second in seconds]]
+        if actions is None:
+            self._look(ACCELERATION_STAGE)
+            forces = -self._batch.bind("qfrc_bias")[:, at]
+        else:
+            # What no force can move feels all of them.
+            inertias = self._batch.expand("dof_armature")
+            own = inertias[:, at].copy()
+            inertias[:, at] = _IMMOVABLE
+            self._command(actions)
+            self._look(ACCELERATION_STAGE)
+            forces = _IMMOVABLE * self._batch.bind("qacc")[:, at]
+            inertias[:, at] = own
+        self._qpos[:, [second.position for second in seconds]] = forces / springs
 
     def begin(self) -> None:
         """Computes the sensor values before the first step."""

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from npdr_ppl.engines.common.robot_files import is_urdf, read_robot, references
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file
-from npdr_ppl.engines.mujoco.export import ExportedMjcf, reloaded, written
+from npdr_ppl.engines.mujoco.export import ExportedMjcf, written
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.engines.mujoco.mjcf_files import reloaded
 from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.engines.mujoco.parameters import Assignments
 from npdr_ppl.errors import ModelError

@@ -9,6 +9,7 @@ has), then ``force.py``.
 """
 
 from npdr_ppl.language.effects.action import ActionEffect, Commands, Uneven
+from npdr_ppl.language.effects.compliance import Carrier, ComplianceEffect
 from npdr_ppl.language.effects.effect import Effect, upper_end
 from npdr_ppl.language.effects.environment import EnvironmentEffect, ParameterEffect
 from npdr_ppl.language.effects.force import ForceEffect, LinearForceEffect
@@ -18,7 +19,9 @@ from npdr_ppl.language.effects.servo import ServoEffect
 __all__ = [
     "ActionEffect",
     "BentSensorEffect",
+    "Carrier",
     "Commands",
+    "ComplianceEffect",
     "Effect",
     "EnvironmentEffect",
     "ForceEffect",

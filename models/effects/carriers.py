@@ -1,0 +1,61 @@
+"""What carries a joint yields: a base that rocks, or a gear with the encoder on its motor."""
+
+from collections.abc import Mapping
+
+import pyro.distributions as dist
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.language.channels import Parameter, Port
+from npdr_ppl.language.effects import Carrier, ComplianceEffect
+from npdr_ppl.models.effects.equivalence import UNSEEN_TURN
+from npdr_ppl.models.effects.references import SPONG_1987
+
+__all__ = ["BaseCompliance"]
+
+_RIGID = 1e-18
+"""Compliance, relative to a typical one, at which nothing yields by more than rounding errors."""
+
+
+class BaseCompliance(ComplianceEffect):
+    """φ/c + 2 ζ T φ̇/c + T² φ̈/c = −τ: what carries the joint turns by φ under its force τ.
+
+    The encoder measures the joint relative to its carrier, so it does not see φ, but all further
+    links move with it. A base that rocks about the joint's axis does so, and a gear that twists
+    behind the motor's encoder. T is the time constant of the carrier without what the joint moves,
+    which slows it: with an inertia J, it is √(T² + c J).
+    """
+
+    id = "base_compliance"
+    parameters = (
+        Parameter("compliance", "{coordinate}/({port})", 0.0, "compliance c"),
+        Parameter("time_constant", "s", 0.02, "time constant T of the carrier alone"),
+        Parameter("damping_ratio", "1", 0.1, "damping ratio ζ of the carrier alone"),
+    )
+    strength = ("compliance",)
+    is_smooth = False
+    has_local_minima = True
+    law = "φ + 2 ζ T φ̇ + T² φ̈ = −c τ, a turn that the encoder does not see"
+    equivalence = (UNSEEN_TURN,)
+    excitation = "chirp"
+    reference = SPONG_1987
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Compliance half-normal: 1 % of the rated excursion at the rated force."""
+        return {
+            "compliance": dist.HalfNormal(self._typical(port)),
+            "time_constant": dist.LogNormal(-4.0, 0.7),
+            "damping_ratio": dist.LogNormal(-2.3, 0.7),
+        }
+
+    def carrier(self, parameters: Mapping[str, Tensor]) -> Carrier:
+        """Returns the carrier."""
+        stiffness = 1.0 / parameters["compliance"].clamp_min(_RIGID)
+        time = parameters["time_constant"]
+        return Carrier(
+            stiffness, 2.0 * parameters["damping_ratio"] * time * stiffness, time**2 * stiffness
+        )
+
+    @staticmethod
+    def _typical(port: Port) -> float:
+        return 0.01 * port.rated_position / port.rated
