@@ -12,6 +12,7 @@ from npdr_ppl.models.effects.actuation import (
     SupplySag,
 )
 from npdr_ppl.models.effects.candidates import candidate_effects
+from npdr_ppl.models.effects.carriers import BaseCompliance
 from npdr_ppl.models.effects.disturbances import (
     Cogging,
     ParameterDrift,
@@ -58,6 +59,7 @@ __all__ = [
     "ActuatorLag",
     "AsymmetricCoulombFriction",
     "Backlash",
+    "BaseCompliance",
     "Bias",
     "ClockSkew",
     "Cogging",

@@ -87,6 +87,7 @@ EFFECTS = (
     "hardening_spring",
     "joint_elasticity",
     "backlash",
+    "base_compliance",
     "payload",
     "unbalance",
     "tilt",

@@ -14,6 +14,7 @@ TITLES = {
     "actuator_lag": "{where} lag",
     "asymmetric_coulomb_friction": "dry friction of unequal directions at {joint}",
     "backlash": "backlash at {joint}",
+    "base_compliance": "carrier of {joint} that yields",
     "bias": "constant force at {joint}",
     "clock_skew": "clock error",
     "cogging": "cogging at {joint}",

@@ -36,9 +36,10 @@ PORTS = {
 # What needs more of the joint or of rates than Bullet gives, and what needs a port that
 # a scene does not have.
 REFUSED = {
-    "backlash", "clock_skew", "contact", "joint_elasticity", "load_dependent_friction", "payload",
-    "presliding_friction", "sensor_delay", "servo_gain", "servo_force_limit", "servo_dead_band",
-    "servo_integral_action", "goal_speed_limit", "goal_acceleration_limit", "goal_resolution",
+    "backlash", "base_compliance", "clock_skew", "contact", "joint_elasticity",
+    "load_dependent_friction", "payload", "presliding_friction", "sensor_delay", "servo_gain",
+    "servo_force_limit", "servo_dead_band", "servo_integral_action", "goal_speed_limit",
+    "goal_acceleration_limit", "goal_resolution",
 }  # fmt: skip
 
 # Bullet works in float64 here and its Featherstone dynamics of one joint are the same formula.

@@ -61,7 +61,8 @@ CASES = tuple(
 
 
 def test_every_effect_has_a_case():
-    assert {case.values[1].id for case in CASES} == set(effects())
+    # What adds a joint needs a file; see test_second_joints.
+    assert {case.values[1].id for case in CASES} == set(effects()) - {"base_compliance"}
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicitfast"])

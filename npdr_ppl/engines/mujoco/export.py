@@ -87,8 +87,7 @@ def export_mjcf(
     place = simulator.file.parent if needs_folder else None
     original = _Original(before, step, place, has_six_digits=is_urdf(files))
     found = _divided(simulator, given, original)
-    chosen = copy.copy(simulator)
-    chosen.effects = tuple(e for e in simulator.effects if e.name not in found.refused)
+    chosen = simulator.carrying(e for e in simulator.effects if e.name not in found.refused)
     text = _new_text(chosen, given, original, found.in_file)
     callbacks = None
     if found.beside:
@@ -156,12 +155,11 @@ def _divided(
     in_file: list[Effect] = []
     beside: list[Effect] = []
     refused: dict[str, str] = {}
-    alone = copy.copy(simulator)
     for effect in simulator.effects:
         place = in_file if is_in_file(simulator, effect) else beside
         reason = None if place is in_file else why_not(effect)
         if reason is None:
-            alone.effects = (effect,)
+            alone = simulator.carrying((effect,))
             own = {n: given[n] for n in effect.parameter_names if n in given}
             try:
                 _new_text(alone, own, original, (effect,) if place is in_file else ())
@@ -198,7 +196,8 @@ def _new_text(
     # The solver's settings of dry friction follow from what simulations set, without effects.
     set_anyway, _ = simulator.assignments(given, torch.zeros((), dtype=torch.float64))
     model = written(simulator.prepared(original.step, set(set_anyway)), assignments)
-    edits = Edits(MjcfText(original.text.encode()), simulator.model, model)
+    text = simulator.text_with_second or original.text
+    edits = Edits(MjcfText(text.encode()), simulator.model, model)
     for array in dict.fromkeys(array for array, _ in assignments):
         edits.write(array, sorted({at for name, at in assignments if name == array}))
     edits.keep_damping()

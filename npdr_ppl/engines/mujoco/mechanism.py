@@ -4,7 +4,7 @@ import copy
 import importlib
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -107,6 +107,8 @@ class MujocoMechanism(ClosedLoopSimulator):
         self.with_second: dict[tuple[int, ...], WithSecondJoints] = {}
         # The second joint of each port that has one.
         self.second_joints: dict[str, SecondJoint] = {}
+        # The MJCF text with them; empty without any.
+        self.text_with_second = ""
         is_path = isinstance(source, str | PathLike)
         self._label = Path(source).name if is_path else "a model"
         self.substeps, self.num_threads = substeps, num_threads
@@ -204,24 +206,34 @@ class MujocoMechanism(ClosedLoopSimulator):
         changed = super().with_effects(*effects)
         for _, effect, actuator in changed.servo_effects:
             check_servo(self.model, actuator, effect.id)
-        return changed.with_carriers()
+        return changed.carrying(changed.effects)
 
-    def with_carriers(self) -> Self:
-        """Returns a copy whose joints have the second ones that its effects need."""
-        yielding = {e.port for e in self.effects if isinstance(e, ComplianceEffect)}
+    def carrying(self, effects: Iterable[Effect]) -> Self:
+        """Returns a copy with these effects only, and with the second joints that they need.
+
+        Args:
+            effects: The effects, which can be attached to it.
+        """
+        changed = copy.copy(self)
+        changed.effects = tuple(effects)
+        yielding = {e.port for e in changed.effects if isinstance(e, ComplianceEffect)}
         if yielding == self.second_joints.keys():
-            return self
+            return changed
         rigid = self.rigid or self
+        if not yielding:
+            return rigid.carrying(changed.effects)
         chosen = [p for p in rigid.force_ports if p.port.name in yielding]
         key = tuple(port.joint for port in chosen)
         if key not in rigid.with_second:
             rigid.with_second[key] = with_second_joints(rigid.file, rigid.model, key)
         found = rigid.with_second[key]
-        changed = copy.copy(self)
         changed.__dict__.pop("inverse_dynamics", None)  # a cached property of the old model
         changed.rigid, changed.prepared_models = rigid, {}
         changed.model = copy.copy(found.model)
         changed.model.opt.integrator = rigid.model.opt.integrator
+        # Beside a joint that nothing moves, the constraint solver would end too early.
+        changed.model.opt.tolerance = 0.0
+        changed.text_with_second = found.text
         changed.second_joints = {
             port.port.name: second for port, second in zip(chosen, found.seconds, strict=True)
         }

@@ -22,6 +22,12 @@ from npdr_ppl.errors import ModelError
 
 __all__ = ["SecondJoint", "WithSecondJoints", "with_second_joints"]
 
+_ENDING = "_carrier"
+"""What a second joint's name has behind that of the first."""
+
+_IMMOVABLE = 1e12
+"""Armature of second joints in the text, in kg m² or kg; simulations set their own."""
+
 
 class SecondJoint(NamedTuple):
     """Where a model has a second joint.
@@ -73,7 +79,7 @@ def with_second_joints(file: Path | None, model: Any, joints: Sequence[int]) -> 
         raise ModelError("A compiled model has no file, so that no joint can be added to it.")
     text = MjcfText(mjcf_text(file, read_robot(file)).encode())
     edits, names = Edits(text, model, model), element_names(model, "joint")
-    added = {f"{names[joint]}_carrier": joint for joint in joints}
+    added = {f"{names[joint]}{_ENDING}": joint for joint in joints}
     clash = sorted(added.keys() & set(names))
     if clash:
         raise ModelError(f"{file.name} has a joint called {clash[0]!r} already.")
@@ -113,6 +119,7 @@ def _element(name: str, model: Any, joint: int) -> str:
         " ".join(repr(float(x)) for x in array[joint]) for array in (model.jnt_pos, model.jnt_axis)
     )
     return (
+        f"<!-- npdr: a second joint, for what carries {name.removesuffix(_ENDING)} --> "
         f'<joint name="{name}" type="{kind}" pos="{place}" axis="{axis}" limited="false" ref="0" '
-        'springref="0" stiffness="0" damping="0" frictionloss="0" armature="0"/>'
+        f'springref="0" stiffness="0" damping="0" frictionloss="0" armature="{_IMMOVABLE}"/>'
     )

@@ -102,7 +102,8 @@ class MujocoSimulator(MujocoMechanism):
         many of the file's own integrator, and the second call returns ``None``.
         """
         if self.rigid is not None:
-            return self._on(self.rigid.with_finer_steps())
+            finer = self.rigid.with_finer_steps()
+            return finer and finer.carrying(self.effects)
         mujoco: Any = importlib.import_module("mujoco")
         rk4 = mujoco.mjtIntegrator.mjINT_RK4
         is_fourth = self.model.opt.integrator == rk4
@@ -128,20 +129,13 @@ class MujocoSimulator(MujocoMechanism):
     def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
         """Returns a copy with the file's own steps; ``None`` if these are its steps."""
         if self.rigid is not None:
-            return self._on(self.rigid.with_coarser_steps(num_simulations))
+            coarser = self.rigid.with_coarser_steps(num_simulations)
+            return coarser and coarser.carrying(self.effects)
         if self.unrefined is None:
             return None
         changed = copy.copy(self.unrefined)
         changed.effects = self.effects
         return changed
-
-    def _on(self, rigid: Self | None) -> Self | None:
-        """Returns a simulator without second joints with this one's effects."""
-        if rigid is None:
-            return None
-        changed = copy.copy(rigid)
-        changed.effects = self.effects
-        return changed.with_carriers()
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions in float64; see :meth:`Simulator.simulate`."""

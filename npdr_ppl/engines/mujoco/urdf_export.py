@@ -1,6 +1,5 @@
 """Writes identified masses, inertias and joint dynamics into the text of a URDF file."""
 
-import copy
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -55,9 +54,8 @@ def export_urdf(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) ->
     needs_folder = any(True for tree in files.trees.values() for _ in references(tree))
     kept: list[Effect] = []
     refused: dict[str, str] = {}
-    alone = copy.copy(simulator)
     for effect in simulator.effects:
-        alone.effects = (effect,)
+        alone = simulator.carrying((effect,))
         own = {n: given[n] for n in effect.parameter_names if n in given}
         reason = "a URDF file has no place for it; export an .xml file"
         if is_in_file(alone, effect):
@@ -66,14 +64,13 @@ def export_urdf(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) ->
                 kept.append(effect)
                 continue
         refused[effect.name] = reason
-    chosen = copy.copy(simulator)
-    chosen.effects = tuple(kept)
+    chosen = simulator.carrying(kept)
     own_names = {p.name for p in simulator.parameters}
     own_names |= {name for effect in kept for name in effect.parameter_names}
     assignments = file_assignments(
         chosen, {n: v for n, v in given.items() if n in own_names}, kept
     )
-    text = _new_text(simulator, before, assignments, simulator.file.parent)
+    text = _new_text(chosen, before, assignments, simulator.file.parent)
     name, folder = simulator.file.name, simulator.file.parent
     return ExportedMjcf(name, folder, before, text, None, refused, needs_folder)
 
