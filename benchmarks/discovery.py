@@ -263,8 +263,8 @@ def separation(case: Case, catalogue: tuple[npdr.Effect, ...] = ()) -> float:
 def _separation_of_each(case: Case) -> float:
     """Returns the smaller distance from the model with both effects to one without one of them.
 
-    Each model is fitted to the same recording. With a recording in which nothing is hidden, more
-    would differ than what one effect leaves of the other.
+    All are fitted to one recording, so that different noise does not count as separation. The
+    distance is infinite if the model cannot be simulated without either of them.
 
     Raises:
         DataError: The model with both effects cannot be simulated.

@@ -2,9 +2,17 @@
 
 The arm is a link under gravity with a rotor, J q̈ = f − b q̇ + m g l cos q, where q is the angle
 below the horizontal. The servo's force is f = K (e + w) − D q̇ within ±f_max, with the error
-e = g − q of the goal g that its own laws make of the command, and the integral part w. Everything
-is integrated by the Runge-Kutta method in steps of 0.5 ms; laws of goals run in the same steps.
-None of it is the package's.
+e = g − q of the goal g that its own laws make of the command, and the integral part w.
+
+What carries the joint may turn by φ, which the encoder does not see. The rotor's inertia R and the
+link's L, whose sum is J, then accelerate differently, as the carrier with its inertia A, stiffness
+k and damping d does:
+
+    R q̈ + L (q̈ + φ̈) = f − b q̇ + m g l cos(q + φ)
+    A φ̈ + L (q̈ + φ̈) = −k φ − d φ̇ + m g l cos(q + φ)
+
+Everything is integrated by the Runge-Kutta method in steps of 0.5 ms; laws of goals run in the
+same steps. None of it is the package's.
 """
 
 import math
@@ -43,6 +51,10 @@ OWN_INERTIA = 1e-3
 """Inertia of the link about its centre of mass, kg m²."""
 
 
+State = tuple[float, float, float, float, float]
+"""Position, speed, integral part, turn of the carrier and its rate; or the rates of these."""
+
+
 @dataclass(frozen=True)
 class Kind:
     """A kind of law.
@@ -67,10 +79,15 @@ KINDS: dict[str, Kind] = {
     "coarse_goal": Kind("servo.goal_resolution", {"step": (6e-3, 0.015)}),
     "dead_time": Kind("servo.input_delay", {"delay": (0.01, 0.03)}),
     "offset": Kind("hinge.encoder_bias", {"offset": (5e-3, 0.02)}, is_signed=True),
+    "carrier": Kind(
+        "hinge_torque.base_compliance",
+        {"compliance": (0.01, 0.03), "time_constant": (0.02, 0.04), "damping_ratio": (0.05, 0.2)},
+    ),
     "integral": Kind("servo.servo_integral_action", {"rate": (1.0, 4.0), "limit": (0.02, 0.06)}),
 }
 """What may be hidden. Sizes are typical of small servos: 0.3° to 0.9° of dead band or resolution,
-limits that steps of 0.5 rad reach, dead times of one to three samples."""
+limits that steps of 0.5 rad reach, dead times of one to three samples, carriers that the weight
+turns by 0.8° to 2.5°."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +186,7 @@ class _Rig:
         values: dict[str, float],
     ) -> None:
         self.gain, self.servo_damping, self.damping = gain, servo_damping, damping
-        self.inertia = rotor + OWN_INERTIA + MASS * LENGTH**2
+        self.rotor, self.link = rotor, OWN_INERTIA + MASS * LENGTH**2
         self.kind, self.values = kind, values
 
     def run(self, commands: Array) -> Array:
@@ -180,7 +197,8 @@ class _Rig:
         h = SAMPLE / SUBSTEPS
         goals = GOALS.get(self.kind, _as_commanded)(np.repeat(commands, SUBSTEPS), h, self.values)
         first = float(goals[0])
-        state = (self._equilibrium(first), 0.0, 0.0)
+        position, turn = self._equilibrium(first)
+        state: State = (position, 0.0, 0.0, turn, 0.0)
         readings = [state[0]]
         for number, goal in enumerate(goals, 1):
             state = self._stepped(state, float(goal), h)
@@ -189,37 +207,43 @@ class _Rig:
         offset = self.values["offset"] if self.kind == "offset" else 0.0
         return np.array(readings)[:, None] + offset
 
-    def _equilibrium(self, goal: float) -> float:
-        position = goal
+    def _equilibrium(self, goal: float) -> tuple[float, float]:
+        """Returns where the joint and its carrier rest."""
+        position, turn = goal, 0.0
         for _ in range(100):
-            load = MASS * GRAVITY * LENGTH * math.cos(position) / self.gain
-            position = goal + load + (self.values["width"] if self.kind == "dead_band" else 0.0)
-        return position
+            load = MASS * GRAVITY * LENGTH * math.cos(position + turn)
+            position = goal + load / self.gain
+            position += self.values["width"] if self.kind == "dead_band" else 0.0
+            turn = load * self.values["compliance"] if self.kind == "carrier" else 0.0
+        return position, turn
 
-    def _stepped(
-        self, state: tuple[float, float, float], goal: float, h: float
-    ) -> tuple[float, float, float]:
-        """Returns position, speed and integral part after a step of the Runge-Kutta method."""
+    def _stepped(self, state: State, goal: float, h: float) -> State:
+        """Returns the state after a step of the Runge-Kutta method."""
 
-        def moved(rate: tuple[float, float, float], time: float) -> tuple[float, float, float]:
+        def moved(rate: State, time: float) -> State:
+            p, s, i, t, r = rate
             return (
-                state[0] + time * rate[0],
-                state[1] + time * rate[1],
-                state[2] + time * rate[2],
+                state[0] + time * p,
+                state[1] + time * s,
+                state[2] + time * i,
+                state[3] + time * t,
+                state[4] + time * r,
             )
 
         a = self._rates(state, goal)
         b = self._rates(moved(a, 0.5 * h), goal)
         c = self._rates(moved(b, 0.5 * h), goal)
         d = self._rates(moved(c, h), goal)
-        mean = tuple((p + 2 * q + 2 * r + s) / 6 for p, q, r, s in zip(a, b, c, d, strict=True))
-        position, speed, integral = moved((mean[0], mean[1], mean[2]), h)
+        p, s, i, t, r = (
+            (p + 2 * q + 2 * r + s) / 6 for p, q, r, s in zip(a, b, c, d, strict=True)
+        )
+        position, speed, integral, turn, turning = moved((p, s, i, t, r), h)
         if self.kind == "integral":
             integral = min(max(integral, -self.values["limit"]), self.values["limit"])
-        return position, speed, integral
+        return position, speed, integral, turn, turning
 
-    def _rates(self, state: tuple[float, float, float], goal: float) -> tuple[float, float, float]:
-        position, speed, integral = state
+    def _rates(self, state: State, goal: float) -> State:
+        position, speed, integral, turn, turning = state
         error, rate = goal - position, 0.0
         if self.kind == "integral":
             rate = self.values["rate"] * error
@@ -230,8 +254,17 @@ class _Rig:
         if self.kind == "force_limit":
             force = min(max(force, -self.values["limit"]), self.values["limit"])
         force -= self.damping * speed
-        load = MASS * GRAVITY * LENGTH * math.cos(position)
-        return speed, (force + load) / self.inertia, rate
+        load = MASS * GRAVITY * LENGTH * math.cos(position + turn)
+        if self.kind != "carrier":
+            return speed, (force + load) / (self.rotor + self.link), rate, 0.0, 0.0
+        v, time = self.values, self.values["time_constant"]
+        spring = -(turn + 2.0 * v["damping_ratio"] * time * turning) / v["compliance"]
+        # Both equations, solved for both accelerations.
+        own = time**2 / v["compliance"] + self.link
+        both = (self.rotor + self.link) * own - self.link**2
+        fast = (own * (force + load) - self.link * (spring + load)) / both
+        turns = ((self.rotor + self.link) * (spring + load) - self.link * (force + load)) / both
+        return speed, fast, rate, turning, turns
 
 
 def _as_commanded(commands: Array, h: float, values: dict[str, float]) -> Array:

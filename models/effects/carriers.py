@@ -14,16 +14,16 @@ from npdr_ppl.models.effects.references import SPONG_1987
 __all__ = ["BaseCompliance"]
 
 _RIGID = 1e-18
-"""Compliance, relative to a typical one, at which nothing yields by more than rounding errors."""
+"""Least compliance in rad/(N m) or m/N, at which nothing moves by more than rounding errors."""
 
 
 class BaseCompliance(ComplianceEffect):
-    """φ/c + 2 ζ T φ̇/c + T² φ̈/c = −τ: what carries the joint turns by φ under its force τ.
+    """φ + 2 ζ T φ̇ + T² φ̈ = −c τ: what carries the joint turns by φ under its force τ.
 
     The encoder measures the joint relative to its carrier, so it does not see φ, but all further
-    links move with it. A base that rocks about the joint's axis does so, and a gear that twists
-    behind the motor's encoder. T is the time constant of the carrier without what the joint moves,
-    which slows it: with an inertia J, it is √(T² + c J).
+    links move with it. Examples are a base that rocks about the joint's axis, and a gear that
+    twists behind the motor's encoder. T is the time constant of the carrier alone. With the
+    inertia J that the joint moves, the time constant becomes √(T² + c J).
     """
 
     id = "base_compliance"
@@ -43,7 +43,7 @@ class BaseCompliance(ComplianceEffect):
     def default_priors(self, port: Port) -> dict[str, Distribution]:
         """Compliance half-normal: 1 % of the rated excursion at the rated force."""
         return {
-            "compliance": dist.HalfNormal(self._typical(port)),
+            "compliance": dist.HalfNormal(0.01 * port.rated_position / port.rated),
             "time_constant": dist.LogNormal(-4.0, 0.7),
             "damping_ratio": dist.LogNormal(-2.3, 0.7),
         }
@@ -51,11 +51,4 @@ class BaseCompliance(ComplianceEffect):
     def carrier(self, parameters: Mapping[str, Tensor]) -> Carrier:
         """Returns the carrier."""
         stiffness = 1.0 / parameters["compliance"].clamp_min(_RIGID)
-        time = parameters["time_constant"]
-        return Carrier(
-            stiffness, 2.0 * parameters["damping_ratio"] * time * stiffness, time**2 * stiffness
-        )
-
-    @staticmethod
-    def _typical(port: Port) -> float:
-        return 0.01 * port.rated_position / port.rated
+        return Carrier(stiffness, parameters["time_constant"], parameters["damping_ratio"])

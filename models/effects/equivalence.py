@@ -57,7 +57,7 @@ COMMAND_LIMIT = EquivalenceClass(
 )
 UNSEEN_TURN = EquivalenceClass(
     "unseen turn",
-    ("base_compliance", "an elastic gear behind the motor's encoder"),
+    ("base_compliance", "a rocking base", "an elastic gear behind the motor's encoder"),
     "a sensor on the link, or one on the base",
 )
 

@@ -37,7 +37,7 @@ class Alarm:
         strongest: Name of the effect, or of the law outside the catalogue, with the least p-value.
         gain: Greatest reduction of the misfit by one candidate or law.
         p_values: P-value of each candidate and law, by name.
-        limit: The p-value up to which it fires.
+        limit: The p-value up to which it fires: the requested false-alarm rate.
     """
 
     p_value: float
@@ -48,7 +48,7 @@ class Alarm:
 
     @property
     def fired(self) -> bool:
-        """Whether the p-value is low enough for the requested false-alarm rate."""
+        """Whether the p-value is low enough."""
         return self.p_value <= self.limit
 
 

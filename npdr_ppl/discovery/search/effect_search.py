@@ -91,8 +91,9 @@ class Searcher(OriginalModel):
         """
         current, now = first.hypothesis, first
         rounds = [first]
-        # Each round's test is made only after that of the round before was positive. In such a
-        # fixed order, none needs a correction for their number (Marcus, Peritz & Gabriel 1976).
+        # A round is tested only if the alarm of the one before fired. So only the first right
+        # model can give a false alarm, and the number of rounds is not corrected for (compare
+        # Marcus, Peritz & Gabriel 1976). ``benchmarks/discovery.py`` counts effects too many.
         while num_counted(current.effects) < max_effects and is_something_left(first, now):
             # At least the likeliest candidates are fitted, so that there is an answer.
             if len(rounds) > 1 and self._deadline.stops():

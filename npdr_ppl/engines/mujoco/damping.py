@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["fastest_damping"]
+__all__ = ["drive_damping", "fastest_damping"]
 
 
 def fastest_damping(model: Any, positions: NDArray[np.float64]) -> float:
@@ -27,6 +27,17 @@ def fastest_damping(model: Any, positions: NDArray[np.float64]) -> float:
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
+    root = np.sqrt(np.maximum(drive_damping(model), 0.0))
+    return float(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(inertia) * root).max())
+
+
+def drive_damping(model: Any) -> NDArray[np.float64]:
+    """Returns the damping of each degree of freedom, of joints and the servos on them, ``(nv,)``.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
     damping = model.dof_damping.copy()
     for actuator in range(model.nu):
         is_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
@@ -34,5 +45,4 @@ def fastest_damping(model: Any, positions: NDArray[np.float64]) -> float:
             dof = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
             gear = model.actuator_gear[actuator, 0]
             damping[dof] += max(0.0, -gear * gear * model.actuator_biasprm[actuator, 2])
-    root = np.sqrt(np.maximum(damping, 0.0))
-    return float(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(inertia) * root).max())
+    return damping

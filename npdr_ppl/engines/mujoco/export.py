@@ -6,19 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.common.robot_files import is_urdf, read_robot, references
+from npdr_ppl.engines.common.robot_files import is_urdf, read_robot
 from npdr_ppl.engines.mujoco.callbacks.python_file import CallbackFile, callback_file
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.mjcf_edits import Edits, array_of
-from npdr_ppl.engines.mujoco.mjcf_files import mjcf_text, reloaded
+from npdr_ppl.engines.mujoco.mjcf_files import folder_of_assets, mjcf_text, reloaded
 from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
 from npdr_ppl.engines.mujoco.parameters import Assignments
 from npdr_ppl.errors import ModelError
@@ -81,10 +80,7 @@ def export_mjcf(
     step = time_step / simulator.num_substeps(time_step)
     files = read_robot(simulator.file)
     before = mjcf_text(simulator.file, files)
-    # Of a URDF file, meshes that were not found are left out.
-    trees = [ElementTree.fromstring(before)] if is_urdf(files) else files.trees.values()
-    needs_folder = any(True for tree in trees for _ in references(tree))
-    place = simulator.file.parent if needs_folder else None
+    place = folder_of_assets(simulator.file, files)
     original = _Original(before, step, place, has_six_digits=is_urdf(files))
     found = _divided(simulator, given, original)
     chosen = simulator.carrying(e for e in simulator.effects if e.name not in found.refused)
@@ -107,7 +103,7 @@ def export_mjcf(
         text,
         callbacks,
         found.refused,
-        needs_folder,
+        place is not None,
     )
 
 

@@ -5,7 +5,6 @@ import importlib
 import logging
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Self
@@ -30,11 +29,12 @@ from npdr_ppl.engines.mujoco.channels import (
     mjcf_sensors,
     state_components,
 )
+from npdr_ppl.engines.mujoco.damping import drive_damping
 from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
 from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
-from npdr_ppl.engines.mujoco.ports import ForcePort, derive_ports, driven_dofs, force_ports
+from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
 from npdr_ppl.engines.mujoco.second_joints import (
     SecondJoint,
     WithSecondJoints,
@@ -56,9 +56,6 @@ from npdr_ppl.registry import hint
 __all__ = ["MujocoMechanism"]
 
 logger = logging.getLogger(__name__)
-
-_LEAST_TIME_CONSTANT = 2.0
-"""Least time constant of a carrier alone, in engine steps: half of what explicit steps bear."""
 
 
 class MujocoMechanism(ClosedLoopSimulator):
@@ -196,8 +193,9 @@ class MujocoMechanism(ClosedLoopSimulator):
             time_step: Seconds per control step.
             time: Seconds from the start of the rollout to the middle of each segment.
         """
-        assignments, own = self.assignments(given, time)
-        model = self.prepared(time_step / self.num_substeps(time_step), set(assignments))
+        step = time_step / self.num_substeps(time_step)
+        assignments, own = self.assignments(given, time, step)
+        model = self.prepared(step, set(assignments))
         num_threads = self.num_threads or torch.get_num_threads()
         return make_batch(model, assignments, num_simulations, num_threads), Tables(None, own)
 
@@ -225,39 +223,26 @@ class MujocoMechanism(ClosedLoopSimulator):
         chosen = [p for p in rigid.force_ports if p.port.name in yielding]
         key = tuple(port.joint for port in chosen)
         if key not in rigid.with_second:
-            rigid.with_second[key] = with_second_joints(rigid.file, rigid.model, key)
+            rigid.with_second[key] = with_second_joints(
+                rigid.file, rigid.model, key, drive_damping(rigid.model)
+            )
         found = rigid.with_second[key]
-        changed.__dict__.pop("inverse_dynamics", None)  # a cached property of the old model
+        # Cached for the rigid model. With second joints there is no regression for a start.
+        changed.__dict__.pop("inverse_dynamics", None)
         changed.rigid, changed.prepared_models = rigid, {}
         changed.model = copy.copy(found.model)
         changed.model.opt.integrator = rigid.model.opt.integrator
-        # Beside a joint that nothing moves, the constraint solver would end too early.
-        changed.model.opt.tolerance = 0.0
         changed.text_with_second = found.text
         changed.second_joints = {
             port.port.name: second for port, second in zip(chosen, found.seconds, strict=True)
         }
-
-        def moved(component: Component) -> Component:
-            table = found.velocities if component.is_velocity else found.positions
-            return replace(component, address=int(table[component.address]))
-
-        changed.components = tuple(map(moved, rigid.components))
+        changed.components = tuple(map(found.component, rigid.components))
         changed.readings = tuple(
-            moved(r) if isinstance(r, Component) else r for r in rigid.readings
+            found.component(r) if isinstance(r, Component) else r for r in rigid.readings
         )
-        changed.force_ports = tuple(
-            ForcePort(
-                port.port,
-                int(found.joints[port.joint]),
-                int(found.positions[port.position]),
-                int(found.velocities[port.velocity]),
-            )
-            for port in rigid.force_ports
-        )
+        changed.force_ports = tuple(map(found.port, rigid.force_ports))
         changed.bindings = Bindings(changed.model, *self._bound)
-        changed.initial_positions = np.zeros(changed.model.nq)
-        changed.initial_positions[found.positions] = rigid.initial_positions
+        changed.initial_positions = found.pose(rigid.initial_positions)
         return changed
 
     @property
@@ -271,14 +256,16 @@ class MujocoMechanism(ClosedLoopSimulator):
         ]
 
     def assignments(
-        self, given: Mapping[str, Tensor], time: Tensor
+        self, given: Mapping[str, Tensor], time: Tensor, step: float | None = None
     ) -> tuple[Assignments, tuple[dict[str, Tensor], ...]]:
         """Returns what to write into the model, and the effects' parameters by short name.
 
         Args:
             given: Given parameters, ``(N,)`` or numbers, in float64.
             time: Seconds from the start of the rollout to the middle of each segment.
+            step: Seconds per engine step; its own by default.
         """
+        step = step or self.time_step / self.num_substeps(self.time_step)
         complete = self.complete(given, torch.float64, torch.device("cpu"))
         domain = self.changed(complete, time)
         drifting = {e.port for e in self.effects if isinstance(e, ParameterEffect)}
@@ -293,15 +280,8 @@ class MujocoMechanism(ClosedLoopSimulator):
         by_port = {port.port.name: port for port in self.force_ports}
         for effect, values in zip(self.effects, own, strict=True):
             if isinstance(effect, ComplianceEffect):
-                second, carrier = self.second_joints[effect.port], effect.carrier(values)
-                least = _LEAST_TIME_CONSTANT * self.time_step / self.num_substeps(self.time_step)
-                assignments |= {
-                    ("jnt_stiffness", second.joint): carrier.stiffness,
-                    ("dof_damping", second.velocity): carrier.damping,
-                    ("dof_armature", second.velocity): torch.maximum(
-                        carrier.inertia, least**2 * carrier.stiffness
-                    ),
-                }
+                second = self.second_joints[effect.port]
+                assignments |= second.assignments(effect.carrier(values), step, assignments)
             if isinstance(effect, ForceEffect) and self.is_native(effect):
                 port = by_port[effect.port]
                 assignments |= native_law(self.model, port, effect, values, assignments)

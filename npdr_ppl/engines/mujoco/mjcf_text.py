@@ -51,6 +51,7 @@ class MjcfText:
         self._changed: dict[int, dict[str, str | None]] = {}
         self._comments: dict[int, list[str]] = {}
         self._inside: dict[int, str] = {}
+        self._before: dict[int, str] = {}
 
     def within(self, section: str) -> list[int]:
         """Returns the numbers of the tags below elements of the outermost one.
@@ -86,10 +87,15 @@ class MjcfText:
         """Puts an element behind a start tag, as the first child of its element."""
         self._inside[number] = element
 
+    def insert_before(self, number: int, element: str) -> None:
+        """Puts an element before an element, in the same one."""
+        self._before[number] = element
+
     def result(self) -> str:
         """Returns the text with all changes."""
         text = self.text
-        for number in sorted({*self._changed, *self._comments, *self._inside}, reverse=True):
+        places = {*self._changed, *self._comments, *self._inside, *self._before}
+        for number in sorted(places, reverse=True):
             tag = self.tags[number]
             written = text[tag.start : tag.end]
             indent = _indent(text, tag.start)
@@ -99,6 +105,8 @@ class MjcfText:
                 written = _opened(written, tag.name, self._inside[number], indent)
             comments = self._comments.get(number, ())
             before = b"".join(f"<!-- {text} -->".encode() + indent for text in comments)
+            if number in self._before:
+                before = self._before[number].encode() + indent + before
             text = text[: tag.start] + before + written + text[tag.end :]
         return text.decode()
 

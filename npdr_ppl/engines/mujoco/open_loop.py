@@ -146,7 +146,8 @@ class _Replay:
             state = state._replace(servo_memory=servo_memory)
             controls = self._controls(chain, state, tables, records, first, last)
             if self.simulator.second_joints:
-                chain.settle(torch.from_numpy(controls[:, 0, 0]).unbind(-1))
+                begun = torch.from_numpy(controls[:, 0, 0]).unbind(-1)
+                chain.settle(state, tables, begun)
                 chain.begin()
             if chain.has_forces:
                 return self._step_by_step(chain, state, tables, controls)

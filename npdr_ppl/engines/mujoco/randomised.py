@@ -17,7 +17,7 @@ from npdr_ppl.engines.mujoco.callbacks.python_file import (
 from npdr_ppl.engines.mujoco.effects_in_file import file_assignments, is_in_file, why_not
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import Effect
+from npdr_ppl.language.effects import ComplianceEffect, Effect
 from npdr_ppl.python_text import plain, quoted
 
 __all__ = ["Field", "RandomisedFields", "gymnasium_file", "randomised_fields"]
@@ -62,9 +62,15 @@ def randomised_fields(
     Raises:
         ModelError: A number belongs to something that has no single name.
     """
+    refused = {
+        e.name: "it adds a joint, which the environment's robot does not have"
+        for e in simulator.effects
+        if isinstance(e, ComplianceEffect)
+    }
+    simulator = simulator.carrying(e for e in simulator.effects if e.name not in refused)
     in_file = tuple(e for e in simulator.effects if is_in_file(simulator, e))
     others = [e for e in simulator.effects if e not in in_file]
-    refused = {e.name: reason for e in others if (reason := why_not(e)) is not None}
+    refused |= {e.name: reason for e in others if (reason := why_not(e)) is not None}
     given = {n: torch.as_tensor(v).double() for n, v in parameters.items()}
     num = max((value.numel() for value in given.values()), default=1)
     drawn = file_assignments(simulator, given, in_file)

@@ -1,32 +1,40 @@
 """Second joints on the axes of a robot's joints, for carriers that yield.
 
-The second joint is a part of the MJCF file, so the engine knows how it moves every link, and that
-gravity, the mass matrix and the drives of all joints change with it. Which of two joints on one
-axis comes first does not matter.
+The second joint is a part of the MJCF file, directly before the joint. So the engine knows how all
+links, weights and drives react to its motion.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from npdr_ppl.engines.common.robot_files import read_robot
+from npdr_ppl.engines.mujoco.channels import Component
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.mjcf_edits import Edits
-from npdr_ppl.engines.mujoco.mjcf_files import mjcf_text, reloaded
-from npdr_ppl.engines.mujoco.mjcf_text import MjcfText
+from npdr_ppl.engines.mujoco.mjcf_files import folder_of_assets, mjcf_text, reloaded
+from npdr_ppl.engines.mujoco.mjcf_text import MjcfText, Tag
+from npdr_ppl.engines.mujoco.parameters import Assignments
+from npdr_ppl.engines.mujoco.ports import ForcePort
 from npdr_ppl.errors import ModelError
+from npdr_ppl.language.effects import Carrier
 
-__all__ = ["SecondJoint", "WithSecondJoints", "with_second_joints"]
+__all__ = ["IMMOVABLE", "SecondJoint", "WithSecondJoints", "with_second_joints"]
 
-_ENDING = "_carrier"
-"""What a second joint's name has behind that of the first."""
+IMMOVABLE = 1e12
+"""Inertia that no force moves, in kg m² or kg."""
 
-_IMMOVABLE = 1e12
-"""Armature of second joints in the text, in kg m² or kg; simulations set their own."""
+_LEAST_TIME_CONSTANT = 2.0
+"""Least time constant of a carrier alone, in engine steps. Explicit steps bear half a step."""
+
+_MOST_DAMPED = 1.0
+"""Greatest damping ratio of a carrier. Explicit steps bear 2.5 with the least time constant."""
 
 
 class SecondJoint(NamedTuple):
@@ -36,11 +44,40 @@ class SecondJoint(NamedTuple):
         joint: Its number.
         position: Its index in qpos.
         velocity: Its index in qvel.
+        first: Number of the first joint.
+        damping: Damping of the first joint and its servos, {force} s/{coordinate}.
     """
 
     joint: int
     position: int
     velocity: int
+    first: int
+    damping: float
+
+    def assignments(self, carrier: Carrier, step: float, others: Assignments) -> Assignments:
+        """Returns what to write into the model for a carrier.
+
+        It is as heavy as explicit steps need: they are stable if it oscillates slowly, and if the
+        drive's damping does not stop it within a step.
+
+        Args:
+            carrier: The carrier.
+            step: Seconds per engine step.
+            others: What else is written; the second joint has the place of the first one.
+        """
+        time = carrier.time_constant.clamp_min(_LEAST_TIME_CONSTANT * step)
+        inertia = (time**2 * carrier.stiffness).clamp_min(self.damping * step)
+        ratio = carrier.damping_ratio.clamp_max(_MOST_DAMPED)
+        placed = {
+            (array, 3 * self.joint + place % 3): value
+            for (array, place), value in others.items()
+            if array in ("jnt_pos", "jnt_axis") and place // 3 == self.first
+        }
+        return placed | {
+            ("jnt_stiffness", self.joint): carrier.stiffness,
+            ("dof_damping", self.velocity): 2.0 * ratio * torch.sqrt(inertia * carrier.stiffness),
+            ("dof_armature", self.velocity): inertia,
+        }
 
 
 @dataclass(frozen=True)
@@ -63,63 +100,108 @@ class WithSecondJoints:
     positions: NDArray[np.int64]
     velocities: NDArray[np.int64]
 
+    def component(self, old: Component) -> Component:
+        """Returns a component of the state at its new address."""
+        table = self.velocities if old.is_velocity else self.positions
+        return replace(old, address=int(table[old.address]))
 
-def with_second_joints(file: Path | None, model: Any, joints: Sequence[int]) -> WithSecondJoints:
+    def port(self, old: ForcePort) -> ForcePort:
+        """Returns a joint's port at its new address."""
+        return ForcePort(
+            old.port,
+            int(self.joints[old.joint]),
+            int(self.positions[old.position]),
+            int(self.velocities[old.velocity]),
+        )
+
+    def pose(self, old: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns positions ``qpos`` in which no spring of a second joint is bent."""
+        return _spread(old, self.positions, len(self.seconds))
+
+
+def with_second_joints(
+    file: Path | None, model: Any, joints: Sequence[int], damping: NDArray[np.float64]
+) -> WithSecondJoints:
     """Returns a file's model in which some joints have a second one on the same axis.
 
     Args:
         file: The MJCF or URDF file.
         model: Its ``mujoco.MjModel``.
         joints: Numbers of the joints, hinges or slides.
+        damping: Damping of each degree of freedom, that of servos included.
 
     Raises:
-        ModelError: There is no file, or a joint has no name in it.
+        ModelError: There is no file, a joint has no name in it, or it cannot be written.
     """
     if file is None:
         raise ModelError("A compiled model has no file, so that no joint can be added to it.")
-    text = MjcfText(mjcf_text(file, read_robot(file)).encode())
+    files = read_robot(file)
+    text = MjcfText(mjcf_text(file, files).encode())
     edits, names = Edits(text, model, model), element_names(model, "joint")
-    added = {f"{names[joint]}{_ENDING}": joint for joint in joints}
-    clash = sorted(added.keys() & set(names))
+    own = {joint: f"{names[joint]}_carrier" for joint in joints}
+    clash = sorted(set(own.values()) & set(names))
     if clash:
         raise ModelError(f"{file.name} has a joint called {clash[0]!r} already.")
-    by_body: dict[int, list[str]] = {}
-    for name, joint in added.items():
-        holder = edits.element("joint", joint)
-        while text.tags[holder].name != "body":  # positions in a <frame> are other ones
-            holder = text.tags[holder].parent
-        by_body.setdefault(holder, []).append(_element(name, model, joint))
-    for holder, elements in by_body.items():
-        text.insert(holder, " ".join(elements))
+    for joint, name in own.items():
+        place = edits.element("joint", joint)
+        note = f"npdr: what carries {names[joint]}"
+        text.insert_before(place, f"<!-- {note} --> {_element(name, text.tags[place])}")
+    positions = _shifted(model.nq, [int(model.jnt_qposadr[joint]) for joint in joints])
+    velocities = _shifted(model.nv, [int(model.jnt_dofadr[joint]) for joint in joints])
+    for i in (i for i, tag in enumerate(text.tags) if tag.name == "key"):
+        for attribute, table in (("qpos", positions), ("qvel", velocities)):
+            if attribute in text.tags[i].attributes:
+                old = np.array(text.tags[i].attributes[attribute].split(), dtype=float)
+                new = _spread(old, table, len(joints))
+                text.set(i, {attribute: " ".join(repr(float(number)) for number in new)})
+    # Beside a joint that nothing moves, the constraint solver would end too early.
+    edits.option("tolerance", "0", repr(float(model.opt.tolerance)))
     changed = text.result()
-    found = reloaded(changed, ".xml", file.parent)
+    found = reloaded(changed, ".xml", folder_of_assets(file, files))
     found_names = element_names(found, "joint")
-    kept = [j for j, name in enumerate(found_names) if name not in added]
+    kept = [j for j, name in enumerate(found_names) if name not in own.values()]
     if [found_names[j] for j in kept] != names:
         raise ModelError(f"Every joint of {file.name} needs a name, so that one can be added.")
     seconds = tuple(
-        SecondJoint(j, int(found.jnt_qposadr[j]), int(found.jnt_dofadr[j]))
-        for j in map(found_names.index, added)
+        SecondJoint(
+            second := found_names.index(name),
+            int(found.jnt_qposadr[second]),
+            int(found.jnt_dofadr[second]),
+            kept[joint],
+            float(damping[model.jnt_dofadr[joint]]),
+        )
+        for joint, name in own.items()
     )
-    own = {s.position for s in seconds}, {s.velocity for s in seconds}
-    return WithSecondJoints(
-        changed,
-        found,
-        seconds,
-        np.array(kept),
-        np.array([i for i in range(found.nq) if i not in own[0]]),
-        np.array([i for i in range(found.nv) if i not in own[1]]),
-    )
+    return WithSecondJoints(changed, found, seconds, np.array(kept), positions, velocities)
 
 
-def _element(name: str, model: Any, joint: int) -> str:
-    """Returns the element of a joint on the axis of another; it has no default's properties."""
-    kind = "slide" if int(model.jnt_type[joint]) == 2 else "hinge"
-    place, axis = (
-        " ".join(repr(float(x)) for x in array[joint]) for array in (model.jnt_pos, model.jnt_axis)
-    )
-    return (
-        f"<!-- npdr: a second joint, for what carries {name.removesuffix(_ENDING)} --> "
-        f'<joint name="{name}" type="{kind}" pos="{place}" axis="{axis}" limited="false" ref="0" '
-        f'springref="0" stiffness="0" damping="0" frictionloss="0" armature="{_IMMOVABLE}"/>'
-    )
+def _shifted(size: int, places: Sequence[int]) -> NDArray[np.int64]:
+    """Returns new indices of numbers, before some of which another one is inserted."""
+    old = np.arange(size)
+    return old + (np.array(places)[:, None] <= old).sum(0)
+
+
+def _spread(old: NDArray[np.float64], table: NDArray[np.int64], more: int) -> NDArray[np.float64]:
+    """Returns numbers at new indices, with zeros between them."""
+    new = np.zeros(len(old) + more)
+    new[table] = old
+    return new
+
+
+def _element(name: str, first: Tag) -> str:
+    """Returns a second joint's element: placed as the first, without its forces and limits."""
+    placed = {n: v for n, v in first.attributes.items() if n in ("type", "pos", "axis", "class")}
+    attributes = placed | {
+        "name": name,
+        "limited": "false",
+        "actuatorfrclimited": "false",
+        "actuatorgravcomp": "false",
+        "ref": "0",
+        "springref": "0",
+        "springdamper": "0 0",
+        "stiffness": "0",
+        "damping": "0",
+        "frictionloss": "0",
+        "armature": repr(IMMOVABLE),
+    }
+    return f"<joint {' '.join(f'{n}={quoteattr(v)}' for n, v in attributes.items())}/>"

@@ -15,15 +15,13 @@ from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.engines.mujoco.second_joints import IMMOVABLE
 from npdr_ppl.engines.mujoco.servos import ServoErrors
 
 __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 
 ACCELERATION_STAGE = 3
 """Stage of sensors that depend on accelerations."""
-
-_IMMOVABLE = 1e12
-"""Inertia that no force moves, in kg m² or kg."""
 
 
 class MujocoStepper(EffectChain):
@@ -82,6 +80,12 @@ class MujocoStepper(EffectChain):
         self._stage = max(stages - {ACCELERATION_STAGE}, default=0)
         self._has_accelerations = ACCELERATION_STAGE in stages
         self._applied = state_view(batch, "qfrc_applied") if self.forces.effects else None
+        self._seconds = tuple(simulator.second_joints.values())
+        if self._seconds:
+            # What is bound later has no values until the engine computes once more.
+            self._accelerations, self._passive, self._bias = (
+                batch.bind(name) for name in ("qacc", "qfrc_passive", "qfrc_bias")
+            )
         self._servos = ServoErrors(
             simulator.model,
             servo_effects,
@@ -110,30 +114,37 @@ class MujocoStepper(EffectChain):
         """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
         place_states(self.simulator, self._batch, components)
 
-    def settle(self, actions: Components | None = None) -> None:
+    def settle(
+        self, state: State | None = None, tables: Tables | None = None, actions: Components = ()
+    ) -> None:
         """Places second joints where their springs balance the forces on them.
 
         Args:
-            actions: The first commands after all effects; without them, only weights act.
+            state: The state as a segment begins; without it, only weights are balanced.
+            tables: Constants of the simulation.
+            actions: The first commands after all effects.
         """
-        seconds = list(self.simulator.second_joints.values())
-        if not seconds:
+        if not self._seconds:
             return
-        at = [second.velocity for second in seconds]
-        springs = self._batch.expand("jnt_stiffness")[:, [second.joint for second in seconds]]
-        if actions is None:
+        at = [second.velocity for second in self._seconds]
+        springs = self._batch.expand("jnt_stiffness")[:, [s.joint for s in self._seconds]]
+        if state is None or tables is None:
             self._look(ACCELERATION_STAGE)
-            forces = -self._batch.bind("qfrc_bias")[:, at]
+            forces = (self._passive - self._bias)[:, at]
         else:
-            # What no force can move feels all of them.
+            self._command(actions)
+            self._servos.apply(tables, state.servo_memory, self._engine_step)
+            if self.forces.effects:
+                positions, velocities = self.at_joints((), ())
+                self._apply(state._replace(positions=positions, velocities=velocities), tables)
+            # The acceleration of an immovable joint, times its inertia, is the force on it.
             inertias = self._batch.expand("dof_armature")
             own = inertias[:, at].copy()
-            inertias[:, at] = _IMMOVABLE
-            self._command(actions)
+            inertias[:, at] = IMMOVABLE
             self._look(ACCELERATION_STAGE)
-            forces = _IMMOVABLE * self._batch.bind("qacc")[:, at]
+            forces = IMMOVABLE * self._accelerations[:, at]
             inertias[:, at] = own
-        self._qpos[:, [second.position for second in seconds]] = forces / springs
+        self._qpos[:, [second.position for second in self._seconds]] = forces / springs
 
     def begin(self) -> None:
         """Computes the sensor values before the first step."""

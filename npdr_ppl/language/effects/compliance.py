@@ -13,24 +13,24 @@ __all__ = ["Carrier", "ComplianceEffect"]
 
 
 class Carrier(NamedTuple):
-    """What lies between a joint and a fixed place, as far as it turns about the joint's axis.
+    """The spring, the damper and the inertia between a joint and the body that carries it.
 
     Attributes:
-        stiffness: Of its spring, {force}/{coordinate}.
-        damping: Of its damper, {force} s/{coordinate}.
-        inertia: Its own inertia or mass, without what the joint moves.
+        stiffness: Of the spring, k, {force}/{coordinate}.
+        time_constant: √(I/k) with the inertia or mass I of the carrier alone, s.
+        damping_ratio: Damping ratio of the carrier alone.
     """
 
     stiffness: Tensor
-    damping: Tensor
-    inertia: Tensor
+    time_constant: Tensor
+    damping_ratio: Tensor
 
 
 class ComplianceEffect(Effect):
-    """An effect by which a joint has a second one on its axis, which its sensor does not see.
+    """An effect that adds a second joint on the axis of a joint, whose sensor does not see it.
 
     The engine moves the second joint together with all others, so that the whole mechanism reacts
-    to it. As a segment begins it is where the spring balances the forces on it.
+    to it. At the start of a segment its spring balances the forces on it.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
@@ -43,7 +43,7 @@ class ComplianceEffect(Effect):
     def carrier(self, parameters: Mapping[str, Tensor]) -> Carrier:
         """Returns the carrier.
 
-        At zero strength it must be so stiff and heavy that nothing moves it.
+        At zero strength it must be so stiff, and therefore so heavy, that nothing moves it.
 
         Args:
             parameters: The effect's parameters by short name.
