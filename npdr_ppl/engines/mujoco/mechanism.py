@@ -228,7 +228,7 @@ class MujocoMechanism(ClosedLoopSimulator):
             )
         found = rigid.with_second[key]
         # Cached for the rigid model. With second joints there is no regression for a start.
-        changed.__dict__.pop("inverse_dynamics", None)
+        vars(changed).pop("inverse_dynamics", None)
         changed.rigid, changed.prepared_models = rigid, {}
         changed.model = copy.copy(found.model)
         changed.model.opt.integrator = rigid.model.opt.integrator
