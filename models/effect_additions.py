@@ -27,7 +27,8 @@ from npdr_ppl.registry import hint
 __all__ = ["Addition", "add_file", "check_effect", "remove_file"]
 
 _ROUNDING = 1e-9
-"""Difference, in a sensor's unit, up to which trajectories differ by rounding errors only."""
+"""Trajectories that differ by less, in a sensor's unit, are taken as equal where an effect adds a
+joint."""
 
 SIMULATORS = ("pendulum", "furuta", "cart_pole", "emps", "two_link_arm")
 """Models of the zoo on which an effect is checked: the first that has a port for it."""

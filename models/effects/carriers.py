@@ -14,7 +14,8 @@ from npdr_ppl.models.effects.references import SPONG_1987
 __all__ = ["BaseCompliance"]
 
 _RIGID = 1e-18
-"""Least compliance in rad/(N m) or m/N, at which nothing moves by more than rounding errors."""
+"""Smaller compliances, in rad/(N m) or m/N, are replaced by this one, at which nothing moves by
+more than rounding errors."""
 
 
 class BaseCompliance(ComplianceEffect):

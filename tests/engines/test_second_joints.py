@@ -20,7 +20,7 @@ from npdr_ppl.policies.linear import Linear
 # Two links in a vertical plane, each behind a position servo.
 ARM = """
 <mujoco>
-  <default><joint damping="0.2" armature="0.05" stiffness="0"/></default>
+  <default><joint damping="0.2" armature="0.05"/></default>
   <option timestep="0.002" integrator="implicitfast"/>
   <worldbody>
     <body name="upper" pos="0 0 1">
@@ -289,6 +289,25 @@ def test_light_and_strongly_damped_carriers_stay_stable(tmp_path, integrator, nu
     attached = cart(tmp_path, integrator=integrator).with_effects(HINGE)
     moved = attached.simulate(values_of(HINGE, numbers), still(attached, 0.3))
     assert bool(moved.isfinite().all()) and float(moved.abs().max()) < 10.0
+
+
+@pytest.mark.parametrize("bound", ["joint hinge damping", "actuator up kv"])
+def test_a_light_carrier_stays_stable_behind_a_drive_that_a_parameter_damps(tmp_path, bound):
+    attached = cart(tmp_path, integrator="RK4", parameters={"damping": bound}).with_effects(HINGE)
+    given = {**values_of(HINGE, (0.02, 1e-4, 0.1)), "damping": torch.tensor([5.0, 60.0]).double()}
+    moved = attached.simulate(given, still(attached, 0.3))
+    assert bool(moved.isfinite().all()) and float(moved.abs().max()) < 10.0
+
+
+def test_no_default_of_the_file_reaches_a_carrier(tmp_path):
+    classes = '<default><joint stiffness="1 2 3" damping="1 2 3" springdamper="0 0"/></default>'
+    (tmp_path / "arm.xml").write_text(ARM.replace("<worldbody>", classes + "<worldbody>", 1))
+    attached = MujocoSimulator(tmp_path / "arm.xml").with_effects(BaseCompliance("elbow_torque"))
+    second = attached.second_joints["elbow_torque"]
+    model = attached.model
+    assert model.jnt_stiffness[second.joint] == model.dof_damping[second.velocity] == 0.0
+    for name, row in (("jnt_stiffnesspoly", second.joint), ("dof_dampingpoly", second.velocity)):
+        assert not hasattr(model, name) or not np.any(getattr(model, name)[row])
 
 
 def settled(attached, given, goal, monkeypatch):

@@ -5,6 +5,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
+
+from npdr_ppl.engines.mujoco.parameters import Assignments, present
 
 __all__ = ["drive_damping", "fastest_damping"]
 
@@ -27,22 +30,26 @@ def fastest_damping(model: Any, positions: NDArray[np.float64]) -> float:
     mujoco.mj_forward(model, data)
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
-    root = np.sqrt(np.maximum(drive_damping(model), 0.0))
+    damping = [float(drive_damping(model, dof, {})) for dof in range(model.nv)]
+    root = np.sqrt(np.maximum(damping, 0.0))
     return float(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(inertia) * root).max())
 
 
-def drive_damping(model: Any) -> NDArray[np.float64]:
-    """Returns the damping of each degree of freedom, of joints and the servos on them, ``(nv,)``.
+def drive_damping(model: Any, dof: int, assignments: Assignments) -> Tensor:
+    """Returns the damping of a degree of freedom: that of its joint and of the servos on it.
 
     Args:
         model: A ``mujoco.MjModel``.
+        dof: Number of the degree of freedom.
+        assignments: What is written into the model.
     """
     mujoco: Any = importlib.import_module("mujoco")
-    damping = model.dof_damping.copy()
+    total = present(model, "dof_damping", dof, assignments)
+    width = model.actuator_biasprm.shape[1]
     for actuator in range(model.nu):
         is_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
-        if is_joint and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
-            dof = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
-            gear = model.actuator_gear[actuator, 0]
-            damping[dof] += max(0.0, -gear * gear * model.actuator_biasprm[actuator, 2])
-    return damping
+        is_affine = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        if is_joint and is_affine and model.jnt_dofadr[model.actuator_trnid[actuator, 0]] == dof:
+            slope = present(model, "actuator_biasprm", actuator * width + 2, assignments)
+            total = total + (-(model.actuator_gear[actuator, 0] ** 2) * slope).clamp_min(0.0)
+    return total

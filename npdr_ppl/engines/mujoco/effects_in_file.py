@@ -53,7 +53,10 @@ def why_not(effect: Effect) -> str | None:
 
 
 def file_assignments(
-    simulator: MujocoMechanism, parameters: Mapping[str, Tensor], chosen: Collection[Effect]
+    simulator: MujocoMechanism,
+    parameters: Mapping[str, Tensor],
+    chosen: Collection[Effect],
+    step: float | None = None,
 ) -> Assignments:
     """Returns what to write into a simulator's model for its parameters and effects.
 
@@ -61,8 +64,9 @@ def file_assignments(
         simulator: The simulator with all effects that are written, to the file or beside it.
         parameters: Values of parameters, those of effects included, float64 numbers.
         chosen: The effects that the file holds.
+        step: Seconds per engine step; the simulator's own by default.
     """
-    result, _ = simulator.assignments(parameters, torch.zeros((), dtype=torch.float64))
+    result, _ = simulator.assignments(parameters, torch.zeros((), dtype=torch.float64), step)
     for effect in simulator.effects:
         values = effect.own_parameters(parameters)
         if has_dry_friction(effect):

@@ -188,7 +188,7 @@ def _new_text(
     effects = {name for effect in simulator.effects for name in effect.parameter_names}
     own = {p.name for p in simulator.parameters} | effects
     given = {name: value for name, value in given.items() if name in own}
-    assignments = file_assignments(simulator, given, in_file)
+    assignments = file_assignments(simulator, given, in_file, original.step)
     # The solver's settings of dry friction follow from what simulations set, without effects.
     set_anyway, _ = simulator.assignments(given, torch.zeros((), dtype=torch.float64))
     model = written(simulator.prepared(original.step, set(set_anyway)), assignments)

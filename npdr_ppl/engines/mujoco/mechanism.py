@@ -29,7 +29,6 @@ from npdr_ppl.engines.mujoco.channels import (
     mjcf_sensors,
     state_components,
 )
-from npdr_ppl.engines.mujoco.damping import drive_damping
 from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
@@ -223,11 +222,9 @@ class MujocoMechanism(ClosedLoopSimulator):
         chosen = [p for p in rigid.force_ports if p.port.name in yielding]
         key = tuple(port.joint for port in chosen)
         if key not in rigid.with_second:
-            rigid.with_second[key] = with_second_joints(
-                rigid.file, rigid.model, key, drive_damping(rigid.model)
-            )
+            rigid.with_second[key] = with_second_joints(rigid.file, rigid.model, key)
         found = rigid.with_second[key]
-        # Cached for the rigid model. With second joints there is no regression for a start.
+        # Cached for the rigid model; a model with second joints has no inverse dynamics.
         vars(changed).pop("inverse_dynamics", None)
         changed.rigid, changed.prepared_models = rigid, {}
         changed.model = copy.copy(found.model)
@@ -279,12 +276,14 @@ class MujocoMechanism(ClosedLoopSimulator):
         assignments = with_servos(self.model, commands, self.effects, own, assignments)
         by_port = {port.port.name: port for port in self.force_ports}
         for effect, values in zip(self.effects, own, strict=True):
-            if isinstance(effect, ComplianceEffect):
-                second = self.second_joints[effect.port]
-                assignments |= second.assignments(effect.carrier(values), step, assignments)
             if isinstance(effect, ForceEffect) and self.is_native(effect):
                 port = by_port[effect.port]
                 assignments |= native_law(self.model, port, effect, values, assignments)
+        # These come last: how heavy a carrier has to be follows from its joint's damping.
+        for effect, values in zip(self.effects, own, strict=True):
+            if isinstance(effect, ComplianceEffect):
+                second, carrier = self.second_joints[effect.port], effect.carrier(values)
+                assignments |= second.assignments(self.model, carrier, step, assignments)
         return assignments, own
 
     def is_native(self, effect: Effect) -> bool:

@@ -49,7 +49,7 @@ class Edits:
         if array.startswith("opt."):
             name = array.removeprefix("opt.")
             old, new = (_words(array_of(model, array)) for model in (self.before, self.model))
-            self.option(name, new, old)
+            self._option(name, new, old)
             return
         width = int(np.prod(array_of(self.model, array).shape[1:]))
         if array not in _WRITERS:
@@ -72,16 +72,15 @@ class Edits:
         """Writes the step and the integrator, if they differ from the file's."""
         old = float(self.before.opt.timestep)
         if step != old:
-            self.option("timestep", repr(step), repr(old))
+            self._option("timestep", repr(step), repr(old))
         stated = [self.text.tags[i].attributes for i in self.text.sections("option")]
         named = [attributes["integrator"] for attributes in stated if "integrator" in attributes]
         was = (named or ["Euler"])[-1]
         now = _INTEGRATORS[int(self.model.opt.integrator)]
         if now != was:
-            self.option("integrator", now, was)
+            self._option("integrator", now, was)
 
-    def option(self, name: str, value: str, was: str) -> None:
-        """Writes an option of the engine, with a comment on what it was."""
+    def _option(self, name: str, value: str, was: str) -> None:
         note = f"npdr: {name} {value} (was {was})"
         sections = self.text.sections("option")
         if sections:

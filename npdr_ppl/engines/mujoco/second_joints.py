@@ -4,6 +4,7 @@ The second joint is a part of the MJCF file, directly before the joint. So the e
 links, weights and drives react to its motion.
 """
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from npdr_ppl.engines.common.robot_files import read_robot
 from npdr_ppl.engines.mujoco.channels import Component
+from npdr_ppl.engines.mujoco.damping import drive_damping
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.mjcf_edits import Edits
 from npdr_ppl.engines.mujoco.mjcf_files import folder_of_assets, mjcf_text, reloaded
@@ -28,13 +30,15 @@ from npdr_ppl.language.effects import Carrier
 __all__ = ["IMMOVABLE", "SecondJoint", "WithSecondJoints", "with_second_joints"]
 
 IMMOVABLE = 1e12
-"""Inertia that no force moves, in kg m² or kg."""
+"""Inertia so large that forces do not move it noticeably, in kg m² or kg."""
 
 _LEAST_TIME_CONSTANT = 2.0
-"""Least time constant of a carrier alone, in engine steps. Explicit steps bear half a step."""
+"""Least time constant of a carrier alone, in engine steps. Explicit steps are stable down to half
+a step."""
 
 _MOST_DAMPED = 1.0
-"""Greatest damping ratio of a carrier. Explicit steps bear 2.5 with the least time constant."""
+"""Greatest damping ratio of a carrier. With the least time constant, explicit steps are stable up
+to a ratio of 2.5."""
 
 
 class SecondJoint(NamedTuple):
@@ -45,28 +49,35 @@ class SecondJoint(NamedTuple):
         position: Its index in qpos.
         velocity: Its index in qvel.
         first: Number of the first joint.
-        damping: Damping of the first joint and its servos, {force} s/{coordinate}.
+        first_velocity: Index of the first joint in qvel.
     """
 
     joint: int
     position: int
     velocity: int
     first: int
-    damping: float
+    first_velocity: int
 
-    def assignments(self, carrier: Carrier, step: float, others: Assignments) -> Assignments:
+    def assignments(
+        self, model: Any, carrier: Carrier, step: float, others: Assignments
+    ) -> Assignments:
         """Returns what to write into the model for a carrier.
 
-        It is as heavy as explicit steps need: they are stable if it oscillates slowly, and if the
-        drive's damping does not stop it within a step.
+        The carrier is made heavier where explicit steps would be unstable: where it would swing
+        within two steps, or where the drive's damping would stop it within one. The damping's rate
+        then grows by at most one per step, so that steps of order four are stable up to a rate of
+        1.7 without the carrier.
 
         Args:
+            model: The ``mujoco.MjModel``.
             carrier: The carrier.
             step: Seconds per engine step.
-            others: What else is written; the second joint has the place of the first one.
+            others: Other values to write; a changed place or axis of the first joint also holds
+                for the second.
         """
+        damping = drive_damping(model, self.first_velocity, others)
         time = carrier.time_constant.clamp_min(_LEAST_TIME_CONSTANT * step)
-        inertia = (time**2 * carrier.stiffness).clamp_min(self.damping * step)
+        inertia = torch.maximum(time**2 * carrier.stiffness, damping * step)
         ratio = carrier.damping_ratio.clamp_max(_MOST_DAMPED)
         placed = {
             (array, 3 * self.joint + place % 3): value
@@ -119,16 +130,13 @@ class WithSecondJoints:
         return _spread(old, self.positions, len(self.seconds))
 
 
-def with_second_joints(
-    file: Path | None, model: Any, joints: Sequence[int], damping: NDArray[np.float64]
-) -> WithSecondJoints:
+def with_second_joints(file: Path | None, model: Any, joints: Sequence[int]) -> WithSecondJoints:
     """Returns a file's model in which some joints have a second one on the same axis.
 
     Args:
         file: The MJCF or URDF file.
         model: Its ``mujoco.MjModel``.
         joints: Numbers of the joints, hinges or slides.
-        damping: Damping of each degree of freedom, that of servos included.
 
     Raises:
         ModelError: There is no file, a joint has no name in it, or it cannot be written.
@@ -144,7 +152,7 @@ def with_second_joints(
         raise ModelError(f"{file.name} has a joint called {clash[0]!r} already.")
     for joint, name in own.items():
         place = edits.element("joint", joint)
-        note = f"npdr: what carries {names[joint]}"
+        note = f"npdr: what carries {names[joint]}".replace("--", "- -")
         text.insert_before(place, f"<!-- {note} --> {_element(name, text.tags[place])}")
     positions = _shifted(model.nq, [int(model.jnt_qposadr[joint]) for joint in joints])
     velocities = _shifted(model.nv, [int(model.jnt_dofadr[joint]) for joint in joints])
@@ -154,10 +162,10 @@ def with_second_joints(
                 old = np.array(text.tags[i].attributes[attribute].split(), dtype=float)
                 new = _spread(old, table, len(joints))
                 text.set(i, {attribute: " ".join(repr(float(number)) for number in new)})
-    # Beside a joint that nothing moves, the constraint solver would end too early.
-    edits.option("tolerance", "0", repr(float(model.opt.tolerance)))
     changed = text.result()
     found = reloaded(changed, ".xml", folder_of_assets(file, files))
+    # Beside a joint that nothing moves, the constraint solver would end too early.
+    found.opt.tolerance = 0.0
     found_names = element_names(found, "joint")
     kept = [j for j, name in enumerate(found_names) if name not in own.values()]
     if [found_names[j] for j in kept] != names:
@@ -168,7 +176,7 @@ def with_second_joints(
             int(found.jnt_qposadr[second]),
             int(found.jnt_dofadr[second]),
             kept[joint],
-            float(damping[model.jnt_dofadr[joint]]),
+            int(velocities[model.jnt_dofadr[joint]]),
         )
         for joint, name in own.items()
     )
@@ -190,6 +198,9 @@ def _spread(old: NDArray[np.float64], table: NDArray[np.int64], more: int) -> ND
 
 def _element(name: str, first: Tag) -> str:
     """Returns a second joint's element: placed as the first, without its forces and limits."""
+    mujoco: Any = importlib.import_module("mujoco")
+    # Later versions of the engine have springs and dampers of higher order.
+    none = "0 0 0" if hasattr(mujoco.MjModel, "jnt_stiffnesspoly") else "0"
     placed = {n: v for n, v in first.attributes.items() if n in ("type", "pos", "axis", "class")}
     attributes = placed | {
         "name": name,
@@ -199,8 +210,8 @@ def _element(name: str, first: Tag) -> str:
         "ref": "0",
         "springref": "0",
         "springdamper": "0 0",
-        "stiffness": "0",
-        "damping": "0",
+        "stiffness": none,
+        "damping": none,
         "frictionloss": "0",
         "armature": repr(IMMOVABLE),
     }
