@@ -36,6 +36,9 @@ class BaseCompliance(ComplianceEffect):
     strength = ("compliance",)
     is_smooth = False
     has_local_minima = True
+    # A search among the whole catalogue has not been shown to name it: see the limits in
+    # docs/effects.md.
+    only_if_asked = True
     law = "φ + 2 ζ T φ̇ + T² φ̈ = −c τ, a turn that the encoder does not see"
     equivalence = (UNSEEN_TURN,)
     excitation = "chirp"

@@ -65,7 +65,7 @@ def discover(
     candidates: Annotated[
         str,
         typer.Option(
-            help="Effects to try, in the form of --effect; all if not given.",
+            help="Effects to try, in the form of --effect; the catalogue if not given.",
             autocompletion=complete_effect,
         ),
     ] = "",

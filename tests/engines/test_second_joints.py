@@ -1,11 +1,15 @@
 """What carries a joint yields: MuJoCo's second joints against equations of another integrator."""
 
+from types import SimpleNamespace
+
 import mujoco
 import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
 
+from npdr_ppl.discovery.discovery_options import DiscoveryOptions
+from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.engines.mujoco.randomised import randomised_fields
@@ -49,19 +53,13 @@ def goals(start):
     return np.stack((start[0] + upper, start[1] + lower), axis=1)
 
 
-def segment(simulator, start=(0.3, 0.2)):
-    values = torch.tensor([[*start, 0.0, 0.0]]).double()
-    return Inputs(
-        actions=torch.from_numpy(goals(start))[None],
+def segment(start=(0.3, 0.2)):
+    return Inputs.single(
+        torch.from_numpy(goals(start)),
+        torch.tensor([*start, 0.0, 0.0]).double(),
         action_names=("upper_goal", "lower_goal"),
-        initial_readings=values,
-        initial_values=values,
-        channel_names=("shoulder", "elbow", "shoulder_velocity", "elbow_velocity"),
-        past_actions=torch.zeros(1, 0, 2).double(),
+        state_names=("shoulder", "elbow", "shoulder_velocity", "elbow_velocity"),
         time_step=STEP,
-        mask=torch.ones(1, STEPS, dtype=torch.bool),
-        rollout=torch.zeros(1, dtype=torch.long),
-        start=torch.zeros(1, dtype=torch.long),
     )
 
 
@@ -135,11 +133,12 @@ def test_all_links_move_as_the_equations_say(arm, joint, port, numbers):
     effect = BaseCompliance(port)
     fine = arm.with_finer_steps().with_effects(effect)
     assert fine.model.opt.integrator == fine.rigid.model.opt.integrator
-    inputs = segment(arm)
+    inputs = segment()
     wanted = by_equations(joint, *numbers)
     rigid = by_equations(joint, 1e-9, *numbers[1:])
     found = fine.simulate(values_of(effect, numbers), inputs)[0, :, :2].numpy()
     assert np.abs(found - wanted).max() < 2e-4 * np.abs(wanted - rigid).max()
+    # The file's integrator is of first order, so its error is a share of the step.
     coarse = fine.with_coarser_steps().simulate(values_of(effect, numbers), inputs)
     plain = arm.simulate({}, inputs)
     change = (coarse - plain)[0, :, :2].numpy()
@@ -147,7 +146,7 @@ def test_all_links_move_as_the_equations_say(arm, joint, port, numbers):
 
 
 def test_without_compliance_nothing_changes_by_more_than_rounding_errors(arm):
-    inputs = segment(arm)
+    inputs = segment()
     attached = arm.with_effects(BaseCompliance("shoulder_torque"), BaseCompliance("elbow_torque"))
     assert attached.model.nv == 4 and attached.states == arm.states
     difference = attached.simulate({}, inputs) - arm.simulate({}, inputs)
@@ -157,7 +156,7 @@ def test_without_compliance_nothing_changes_by_more_than_rounding_errors(arm):
 
 def test_simulations_do_not_depend_on_the_others_of_their_batch(arm):
     effect = BaseCompliance("elbow_torque")
-    attached, inputs = arm.with_effects(effect), segment(arm)
+    attached, inputs = arm.with_effects(effect), segment()
     given = {
         f"{effect.name}.{name}": torch.tensor(values).double()
         for name, values in zip(NAMES, ([0.0, 0.01], [0.02, 0.03], [0.1, 0.2]), strict=True)
@@ -171,7 +170,7 @@ def test_simulations_do_not_depend_on_the_others_of_their_batch(arm):
 def test_other_effects_act_at_their_joints_beside_a_second_joint(arm):
     friction = CoulombFriction("elbow_torque")
     given = {f"{friction.name}.magnitude": torch.tensor(0.4).double()}
-    inputs = segment(arm)
+    inputs = segment()
     both = arm.with_effects(BaseCompliance("shoulder_torque"), friction)
     alone = arm.with_effects(friction)
     difference = both.simulate(given, inputs) - alone.simulate(given, inputs)
@@ -180,7 +179,7 @@ def test_other_effects_act_at_their_joints_beside_a_second_joint(arm):
 
 def test_a_short_time_constant_is_as_long_as_the_steps_bear(arm):
     effect = BaseCompliance("elbow_torque")
-    light = arm.with_effects(effect).simulate(values_of(effect, (1e-5, 1e-6, 0.1)), segment(arm))
+    light = arm.with_effects(effect).simulate(values_of(effect, (1e-5, 1e-6, 0.1)), segment())
     assert bool(light.isfinite().all())
 
 
@@ -194,9 +193,21 @@ def test_the_file_that_is_exported_has_the_second_joint(arm, tmp_path):
     names = [state.name for state in arm.states]
     again = MujocoSimulator(tmp_path / "identified.xml", time_step=STEP, states=names)
     # At rest, where no spring is bent.
-    inputs = segment(arm, start=(0.0, 0.0))
+    inputs = segment(start=(0.0, 0.0))
     difference = attached.simulate(numbers, inputs) - again.simulate({}, inputs)
     assert float(difference.abs().max()) < 1e-9
+
+
+def test_a_search_considers_it_only_if_it_is_asked_for(arm):
+    hypothesis = SimpleNamespace(
+        simulator=arm,
+        names=(),
+        segments=SimpleNamespace(inputs=segment(), recorded_rates=None),
+    )
+    every = candidates_at(hypothesis, DiscoveryOptions())
+    assert every and "base_compliance" not in {effect.id for effect in every}
+    asked = DiscoveryOptions(effects=(BaseCompliance("elbow_torque"),))
+    assert [effect.id for effect in candidates_at(hypothesis, asked)] == ["base_compliance"]
 
 
 def test_it_needs_a_file_whose_joints_have_names(arm, tmp_path):

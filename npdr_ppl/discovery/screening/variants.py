@@ -35,7 +35,8 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
     if options.effects is not None:
         candidates = tuple(e for e in options.effects if e.name not in hypothesis.names)
     else:
-        candidates = irreducible(candidate_effects(hypothesis.simulator), hypothesis.names)
+        every = candidate_effects(hypothesis.simulator)
+        candidates = irreducible((e for e in every if not e.only_if_asked), hypothesis.names)
     simulator, time_step = hypothesis.simulator, hypothesis.segments.inputs.time_step
     speeds, result = _recorded_speeds(hypothesis), []
     for effect in candidates:

@@ -58,6 +58,7 @@ class Effect(ABC):
             restart.
         is_noise: Whether it only scatters measurements about the true value. Searches leave out
             such effects, because a fit that simulates the scatter follows the data by chance.
+        only_if_asked: Whether searches consider it only among candidates that the user names.
         wave: Name of the parameter that is the frequency in Hz of a wave in time, empty if none
             is. Priors are too wide to hit a wave's frequency, so a search takes it from the
             spectrum of the residuals and corrects for the number of frequencies it examined.
@@ -86,6 +87,7 @@ class Effect(ABC):
     is_resonant: ClassVar[bool] = False
     has_local_minima: ClassVar[bool] = False
     is_noise: ClassVar[bool] = False
+    only_if_asked: ClassVar[bool] = False
     wave: ClassVar[str] = ""
     rounds: ClassVar[str] = ""
     has_ripples: bool = False
