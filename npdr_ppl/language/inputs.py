@@ -242,14 +242,15 @@ class Inputs:
 
         Args:
             name: The channel.
-            steps: How many steps before the segments' starts, ``(M,)``.
+            steps: How many steps before the segments' starts, ``(M,)`` or ``(M, S)``.
 
         Returns:
             ``None`` if they are unknown.
         """
         if self.recorded_readings is None or name not in self.channel_names:
             return None
-        rows = (self.start - steps.to(self.start.device)[:, None]).clamp_min(0)
+        steps = steps.to(self.start.device).reshape(len(steps), -1)
+        rows = (self.start - steps).clamp(0, self.recorded_readings.shape[1] - 1)
         return self.recorded_readings[self.rollout, rows, self.channel_names.index(name)]
 
     def element(self, index: int) -> "Inputs":

@@ -1,5 +1,6 @@
 """What carries a joint yields: MuJoCo's second joints against equations of another integrator."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -17,9 +18,10 @@ from npdr_ppl.engines.mujoco.stepper import MujocoStepper
 from npdr_ppl.engines.mujoco.urdf_export import export_urdf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import BaseCompliance, CoulombFriction, candidate_effects
+from npdr_ppl.models.effects import BaseCompliance, CoulombFriction, InputDelay, candidate_effects
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
+from npdr_ppl.rollouts import Rollouts
 
 # Two links in a vertical plane, each behind a position servo.
 ARM = """
@@ -44,6 +46,7 @@ ARM = """
 """
 STEP, STEPS = 0.01, 120
 NAMES = "compliance", "time_constant", "damping_ratio"
+SOFT = (0.01, 0.03, 0.1)
 
 
 def goals(start):
@@ -154,6 +157,61 @@ def test_without_compliance_nothing_changes_by_more_than_rounding_errors(arm):
     assert attached.carrying(()).model is arm.model
 
 
+def recorded(joint, numbers, noise=0.0):
+    """Returns a recording by the equations, positions only."""
+    start = np.array([0.3, 0.2])
+    positions = np.concatenate((start[None], by_equations(joint, *numbers)))
+    positions += noise * np.random.default_rng(0).standard_normal(positions.shape)
+    return Rollouts(
+        [positions],
+        [goals(start)],
+        channel_names=("shoulder", "elbow"),
+        action_names=("upper_goal", "lower_goal"),
+        time_step=STEP,
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+@pytest.mark.parametrize(
+    ("joint", "port", "numbers"),
+    [(0, "shoulder_torque", (0.01, 0.03, 0.1)), (1, "elbow_torque", (0.02, 0.03, 0.2))],
+)
+def test_a_carrier_swings_on_from_segment_to_segment(arm, joint, port, numbers, noise):
+    effect = BaseCompliance(port)
+    attached = arm.with_finer_steps().with_effects(effect)
+    wanted = torch.tensor(recorded(joint, numbers).readings[0][1:]).reshape(-1, 20, 2)
+    inputs = recorded(joint, numbers, noise).inputs(segment_length=20)
+
+    def errors(inputs):
+        found = attached.simulate(values_of(effect, numbers), inputs)[..., :2]
+        return (found - wanted).square().mean((1, 2))
+
+    swings = errors(inputs)
+    begins_at_rest = errors(replace(inputs, recorded_readings=None))
+    assert swings[0] == begins_at_rest[0]
+    assert float(swings[1:].mean().sqrt()) < 0.12 * float(begins_at_rest[1:].mean().sqrt())
+
+
+def test_the_past_of_a_carrier_passes_through_the_effects_on_commands(arm):
+    carrier, delay = BaseCompliance("elbow_torque"), InputDelay("lower_goal")
+    numbers = values_of(carrier, SOFT)
+    inputs = recorded(1, SOFT).inputs(segment_length=20)
+    alone = arm.with_effects(carrier).simulate(numbers, inputs)
+    both = arm.with_effects(carrier, delay)
+    prompt = {**numbers, f"{delay.name}.delay": torch.tensor(0.0).double()}
+    assert float((both.simulate(prompt, inputs) - alone).abs().max()) < 1e-12
+    # A goal that comes one step late is the goal of the step before, at first the first one.
+    late = {**numbers, f"{delay.name}.delay": torch.tensor(STEP).double()}
+    goal = torch.cat((inputs.past_actions, inputs.actions), dim=-2)
+    shifted, past = goal.clone(), inputs.past_actions.shape[-2]
+    shifted[:, 1:, 1] = goal[:, :-1, 1]
+    for segment, start in enumerate(inputs.start):
+        shifted[segment, past - start, 1] = goal[segment, past - start, 1]
+    by_hand = replace(inputs, past_actions=shifted[:, :past], actions=shifted[:, past:])
+    difference = both.simulate(late, inputs) - arm.with_effects(carrier).simulate(numbers, by_hand)
+    assert float(difference.abs().max()) < 1e-6
+
+
 def test_simulations_do_not_depend_on_the_others_of_their_batch(arm):
     effect = BaseCompliance("elbow_torque")
     attached, inputs = arm.with_effects(effect), segment()
@@ -259,7 +317,6 @@ CART = """
 </mujoco>
 """
 HINGE = BaseCompliance("hinge_torque")
-SOFT = (0.01, 0.03, 0.1)
 
 
 def cart(folder, *, integrator="implicitfast", gravcomp=0, height=0.1, parameters=None):

@@ -198,8 +198,19 @@ def after_past_commands(
     tables: Tables,
     records: tuple[CommandRecord, ...],
     num_steps: int,
+    *,
+    until: int = 0,
 ) -> State:
-    """Returns the same as :func:`with_past_commands`, from each simulation's own commands."""
-    for step in range(-num_steps, 0):
+    """Returns the same as :func:`with_past_commands`, from each simulation's own commands.
+
+    Args:
+        chain: The effects.
+        state: State at the start of the segments, as if the oldest command had been constant.
+        tables: The effects' parameters.
+        records: Commands of each action channel.
+        num_steps: Number of past steps that were recorded.
+        until: The step, of which 0 is the segment's first, before which to stop.
+    """
+    for step in range(-num_steps, until):
         state, _, _ = chain.actions.act_on_record(state, records, step, tables)
     return state

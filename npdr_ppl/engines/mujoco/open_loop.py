@@ -22,6 +22,7 @@ from npdr_ppl.engines.common.commands import CommandRecord, command_records, com
 from npdr_ppl.engines.common.past_motion import PastMotion, past_motion
 from npdr_ppl.engines.common.segment_start import after_past_commands, recorded_start, true_start
 from npdr_ppl.engines.mujoco.batches import quiet
+from npdr_ppl.engines.mujoco.carrier_past import carrier_past
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.native import run_all_steps
 from npdr_ppl.engines.mujoco.servo_past import with_recorded_past
@@ -93,8 +94,9 @@ class _Replay:
         self.inputs, self.shape = inputs, shape
         self.columns = [inputs.action_names.index(a.name) for a in simulator.actions]
         self.limits = [(a.lower, a.upper) for a in simulator.actions]
-        self.commands, self.rows = self._commands(shape)
         self.start = recorded_start(simulator, inputs, shape)
+        self.carriers = carrier_past(simulator, inputs, shape)
+        self.commands, self.rows = self._commands(shape)
         self.histories = simulator.histories(given, inputs.time_step)
 
     @property
@@ -120,7 +122,7 @@ class _Replay:
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
             records = self._records(chain, first, last)
             components = true_start(chain, tables, recorded, records)
-            past = chain.actions.num_past_steps(self.inputs.past_actions.shape[-2])
+            past = self._num_past(chain)
             chain.place(components)
             chain.begin()
             state = chain.start(
@@ -146,8 +148,10 @@ class _Replay:
             state = state._replace(servo_memory=servo_memory)
             controls = self._controls(chain, state, tables, records, first, last)
             if self.simulator.second_joints:
-                begun = torch.from_numpy(controls[:, 0, 0]).unbind(-1)
-                chain.settle(state, tables, begun)
+                carriers = self.carriers.part(first, last)
+                until = torch.from_numpy(controls[:, : carriers.num_steps + 1])
+                carriers.settle(chain, state, tables, until, components)
+                controls = controls[:, carriers.num_steps :]
                 chain.begin()
             if chain.has_forces:
                 return self._step_by_step(chain, state, tables, controls)
@@ -165,20 +169,29 @@ class _Replay:
     def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Returns limited commands, ``(rows, steps, actions)``, and the row of each simulation.
 
-        There is one row per segment, which many simulations share.
+        There is one row per segment, which many simulations share. They begin with the past steps
+        that carriers need.
         """
-        actions = self.inputs.actions[..., self.columns]
+        past = self.inputs.past_actions
+        past = past[..., past.shape[-2] - self.carriers.num_steps :, :]
+        actions = torch.cat((past, self.inputs.actions), dim=-2)[..., self.columns]
         lower, upper = torch.tensor(self.limits, dtype=torch.float64).reshape(-1, 2).unbind(-1)
         commands = actions.clamp(lower, upper).numpy()
         segments, num_rows = commands.shape[:-2], math.prod(commands.shape[:-2])
         rows = np.broadcast_to(np.arange(num_rows).reshape(segments), shape).reshape(-1)
         return commands.reshape(num_rows, *commands.shape[-2:]), rows
 
+    def _num_past(self, chain: MujocoStepper) -> int:
+        """Returns from how many past commands the action effects' states are computed."""
+        recorded = self.inputs.past_actions.shape[-2]
+        return max(chain.actions.num_past_steps(recorded), self.carriers.num_steps)
+
     def _records(self, chain: MujocoStepper, first: int, last: int) -> tuple[CommandRecord, ...]:
         """Returns the commands of each action channel, if an effect needs them."""
         if not (chain.actions.effects or chain.sensors.effects):
             return ()
         kept = chain.actions.num_kept_steps(self.inputs.past_actions.shape[-2])
+        kept = max(kept, self.carriers.num_steps)
         records = command_records(self.simulator, self.inputs, self.shape, torch.float64, kept)
         return tuple(record.part(first, last) for record in records)
 
@@ -198,7 +211,8 @@ class _Replay:
     ) -> NDArray[np.float64]:
         """Returns actions after all effects, ``(n, steps, engine steps per step, actions)``.
 
-        Without action effects, the third axis has size 1.
+        Without action effects, the third axis has size 1. They begin with the past steps that
+        carriers need.
         """
         rows = self.rows[first:last]
         if not chain.actions.effects:
@@ -207,10 +221,13 @@ class _Replay:
         state, tables, records = few.state, few.tables, few.records
         controls = self.commands[rows[few.first.numpy()], :, None]
         controls = np.repeat(controls, chain.substeps, axis=2)
-        past = chain.actions.num_past_steps(self.inputs.past_actions.shape[-2])
-        state = after_past_commands(chain, state, tables, records, past)
-        for k in range(self.inputs.num_steps):
-            state, actions, moments = chain.actions.act_on_record(state, records, k, tables)
+        num_before = self.carriers.num_steps
+        past = self._num_past(chain)
+        state = after_past_commands(chain, state, tables, records, past, until=-num_before)
+        for k in range(controls.shape[1]):
+            state, actions, moments = chain.actions.act_on_record(
+                state, records, k - num_before, tables
+            )
             reached = tuple(moments.get(channel) for channel in actions)
             means, _ = chain.actions.by_substep(tuple(actions.values()), reached, chain.substeps)
             for part, present in enumerate(means):

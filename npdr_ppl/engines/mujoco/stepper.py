@@ -110,23 +110,48 @@ class MujocoStepper(EffectChain):
         """Returns the state at the start of an episode or segment; see the base class."""
         return super().start(*args, **kwargs)._replace(servo_memory=self._servos.initial_memory())
 
-    def place(self, components: tuple[Tensor, ...]) -> None:
-        """Sets the simulations' states, ``(N,)`` per component of the simulator's state."""
-        place_states(self.simulator, self._batch, components)
+    def place(self, components: Components, chosen: Tensor | None = None) -> None:
+        """Sets the simulations' states and their time to zero; second joints stay as they are.
+
+        What is no component of the state gets the simulator's initial position, and rests.
+
+        Args:
+            components: Components of the simulator's state, ``(N,)`` each.
+            chosen: Which simulations to set, a mask ``(N,)``; by default all.
+        """
+        positions = np.tile(self.simulator.initial_positions, (len(self._qpos), 1))
+        rates = np.zeros_like(self._qvel)
+        for component, value in zip(self.simulator.components, components, strict=True):
+            where = rates if component.is_velocity else positions
+            where[:, component.address] = value.numpy()
+        for second in self._seconds:
+            positions[:, second.position] = self._qpos[:, second.position]
+            rates[:, second.velocity] = self._qvel[:, second.velocity]
+        rows = slice(None) if chosen is None else chosen.numpy()
+        self._qpos[rows], self._qvel[rows] = positions[rows], rates[rows]
+        state_view(self._batch, "time")[rows] = 0.0
 
     def settle(
-        self, state: State | None = None, tables: Tables | None = None, actions: Components = ()
+        self,
+        state: State | None = None,
+        tables: Tables | None = None,
+        actions: Components = (),
+        chosen: Tensor | None = None,
     ) -> None:
-        """Places second joints where their springs balance the forces on them.
+        """Places second joints, at rest, where their springs balance the forces on them.
 
         Args:
             state: The state as a segment begins; without it, only weights are balanced.
             tables: Constants of the simulation.
             actions: The first commands after all effects.
+            chosen: Which simulations to change, a mask ``(N,)``; by default all.
         """
         if not self._seconds:
             return
+        rows = np.arange(len(self._qpos)) if chosen is None else chosen.numpy().nonzero()[0]
+        places = [second.position for second in self._seconds]
         at = [second.velocity for second in self._seconds]
+        self._qpos[rows[:, None], places] = self._qvel[rows[:, None], at] = 0.0
         springs = self._batch.expand("jnt_stiffness")[:, [s.joint for s in self._seconds]]
         if state is None or tables is None:
             self._look(ACCELERATION_STAGE)
@@ -144,7 +169,7 @@ class MujocoStepper(EffectChain):
             self._look(ACCELERATION_STAGE)
             forces = IMMOVABLE * self._accelerations[:, at]
             inertias[:, at] = own
-        self._qpos[:, [second.position for second in self._seconds]] = forces / springs
+        self._qpos[rows[:, None], places] = (forces / springs)[rows]
 
     def begin(self) -> None:
         """Computes the sensor values before the first step."""
@@ -303,21 +328,6 @@ class MujocoStepper(EffectChain):
         else:
             values = _column(self._qvel if what.is_velocity else self._qpos, what.address)
         return torch.where(self.is_lost, torch.nan, values)
-
-
-def place_states(simulator: MujocoMechanism, batch: Any, components: tuple[Tensor, ...]) -> None:
-    """Sets the states of a batch; other components get the simulator's initial positions.
-
-    Args:
-        simulator: The simulator.
-        batch: A ``mujoco.batch.Batch`` of N simulations.
-        components: Values of the simulator's states, ``(N,)`` each.
-    """
-    qpos, qvel = state_view(batch, "qpos"), state_view(batch, "qvel")
-    qpos[:] = simulator.initial_positions
-    for component, value in zip(simulator.components, components, strict=True):
-        where = qvel if component.is_velocity else qpos
-        where[:, component.address] = value.numpy()
 
 
 def lost_simulations(batch: Any) -> np.ndarray:
