@@ -38,7 +38,11 @@ def model_name(model: Any) -> str:
         return model_name(model.args[-1])
     if isinstance(model, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
         return repr(model)
-    return getattr(model, "__name__", type(model).__name__)
+    name = getattr(model, "__name__", type(model).__name__)
+    # Every model that is derived from a robot's file is called so; its own file is called as the
+    # robot's.
+    code = getattr(model, "__code__", None)
+    return Path(code.co_filename).stem if name == "model" and code is not None else name
 
 
 def source_text(model: Any) -> str:

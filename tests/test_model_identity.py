@@ -1,6 +1,7 @@
 """A model's name and file, under what is attached to it and what wraps it."""
 
 import npdr_ppl as npdr
+from npdr_ppl.cli.model_files import load_function
 from npdr_ppl.model_identity import file_text, model_name
 from npdr_ppl.models.effects import CoulombFriction
 from npdr_ppl.models.pendulum import pendulum
@@ -17,3 +18,8 @@ def test_the_file_of_a_model_is_found_under_what_wraps_it():
     noisy = npdr.with_noise(npdr.add_effect(pendulum, CoulombFriction("hinge")), 0.1)
     assert "class Pendulum" in file_text(noisy)
     assert file_text(len) == ""
+
+
+def test_a_function_called_model_has_the_name_of_its_file(tmp_path):
+    (tmp_path / "arm.py").write_text("def model(inputs):\n    pass\n")
+    assert model_name(load_function(tmp_path / "arm.py", "model")) == "arm"
