@@ -47,7 +47,7 @@ def compare(
     simulations: SimulationsOption = 2_000,
     seed: SeedOption = 0,
     mapping: MappingOption = None,
-    holdout: HoldoutOption = "",
+    holdout: HoldoutOption = None,
     holdout_data: HoldoutDataOption = None,
     effect: EffectOption = None,
     embedding: EmbeddingOption = "score",

@@ -59,16 +59,16 @@ def discover(
     data: DataOption,
     out: OutOption,
     mapping: MappingOption = None,
-    holdout: HoldoutOption = "",
+    holdout: HoldoutOption = None,
     holdout_data: HoldoutDataOption = None,
     effect: EffectOption = None,
     candidates: Annotated[
-        str,
+        list[str] | None,
         typer.Option(
             help="Effects to try, in the form of --effect; the catalogue if not given.",
             autocompletion=complete_effect,
         ),
-    ] = "",
+    ] = None,
     segment_length: SegmentLengthOption = "auto",
     initial_state: InitialStateOption = InitialState.UNCERTAIN,
     precision: PrecisionOption = Precision.FLOAT64,
@@ -144,7 +144,7 @@ def discover(
     train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     options = data_options(None, segment_length, initial_state, precision, noise, strict)
     search = DiscoveryOptions(
-        effects=tuple(named_effects([candidates])) if candidates else None,
+        effects=tuple(named_effects(candidates)) if candidates else None,
         max_effects=max_effects,
         false_alarm_rate=false_alarm_rate,
         repeat=repeat,

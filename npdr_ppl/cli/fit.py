@@ -52,7 +52,7 @@ def fit(
     simulations: SimulationsOption = 1_000,
     seed: SeedOption = 0,
     mapping: MappingOption = None,
-    holdout: HoldoutOption = "",
+    holdout: HoldoutOption = None,
     holdout_data: HoldoutDataOption = None,
     effect: EffectOption = None,
     embedding: EmbeddingOption = "score",

@@ -113,7 +113,11 @@ _ROLLOUTS = typer.Option(
 RolloutsOption = Annotated[int, _ROLLOUTS]
 OptionalRolloutsOption = Annotated[int | None, _ROLLOUTS]
 HoldoutOption = Annotated[
-    str, typer.Option(help="Rollouts to hold out and to test on, e.g. 3,4; counted from 0.")
+    list[str] | None,
+    typer.Option(
+        help="Rollouts to hold out and to test on, e.g. 3,4; counted from 0. Repeat the option "
+        "or separate by commas."
+    ),
 ]
 HoldoutDataOption = Annotated[
     Path | None,

@@ -111,7 +111,7 @@ def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:
 
 def resolve_rollouts(
     paths: Sequence[Path],
-    holdout: str = "",
+    holdout: Sequence[str] | None = None,
     *,
     holdout_data: Path | None = None,
     mapping: Path | None = None,
@@ -120,7 +120,7 @@ def resolve_rollouts(
 
     Args:
         paths: CSV, Parquet, NPZ, NetCDF, or logs of any format that a mapping describes.
-        holdout: Positions of held-out rollouts over all files, e.g. ``"3,4"``.
+        holdout: Positions of held-out rollouts over all files, e.g. ``["3,4"]``.
         holdout_data: Another file, all of whose rollouts are held out.
         mapping: Which signals of the logs are channels and actions.
 
@@ -131,26 +131,27 @@ def resolve_rollouts(
         DataError: A file is bad, files do not fit together, a position does not exist, or both
             kinds of held-out rollouts were given.
     """
-    if holdout and holdout_data is not None:
+    chosen = ",".join(holdout or ())
+    if chosen and holdout_data is not None:
         raise DataError("--holdout and --holdout-data exclude each other; give one.")
     rollouts = load_all(paths, mapping)
     if holdout_data is not None:
         return rollouts, load_all([holdout_data], mapping)
-    if not holdout:
+    if not chosen:
         return rollouts, None
     told = paths[0] if len(paths) == 1 else f"all {len(paths)} files together"
     try:
-        test = sorted({int(part) for part in holdout.split(",")})
+        test = sorted({int(part) for part in chosen.split(",")})
     except ValueError:
-        raise DataError(f"--holdout takes positions such as 3,4; got {holdout!r}.") from None
+        raise DataError(f"--holdout takes positions such as 3,4; got {chosen!r}.") from None
     if test[0] < 0 or test[-1] >= len(rollouts):
         raise DataError(
-            f"--holdout {holdout} names rollouts that do not exist: {told} has "
+            f"--holdout {chosen} names rollouts that do not exist: {told} has "
             f"{len(rollouts)}, counted from 0, so the last is {len(rollouts) - 1}."
         )
     if len(test) == len(rollouts):
         raise DataError(
-            f"--holdout {holdout} leaves no rollouts to fit: {told} has {len(rollouts)} in all."
+            f"--holdout {chosen} leaves no rollouts to fit: {told} has {len(rollouts)} in all."
         )
     train = [i for i in range(len(rollouts)) if i not in test]
     return rollouts[train], rollouts[test]

@@ -215,6 +215,7 @@ def test_stages_stop_where_they_are_told_and_an_unfinished_run_goes_on(words, tm
     [
         (["--candidates", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
         (["--candidates", "knee.bias"], "knee"),
+        (["--candidates", "knee.bias", "--candidates", "hinge.bias"], "knee"),
         (["--candidates", "hinge.input_delay"], "hinge"),
         (["--effect", "hinge.coulomb"], "did you mean 'coulomb_friction'"),
         (["--holdout", "9"], "has 4"),
@@ -238,8 +239,9 @@ def test_bad_input_gets_one_sentence(words, recording, tmp_path, changed, senten
 def test_held_out_rollouts_come_from_the_same_file_or_another(recording, tmp_path):
     other = tmp_path / "other.csv"
     pendulum_recording(num_rollouts=2, num_steps=50).to_csv(other)
-    fitted, held_out = resolve_rollouts([recording], "1,3")
-    assert (len(fitted), len(held_out)) == (2, 2)
+    for words in (["1,3"], ["1", "3"]):
+        fitted, held_out = resolve_rollouts([recording], words)
+        assert (len(fitted), len(held_out)) == (2, 2)
     fitted, held_out = resolve_rollouts([recording], holdout_data=other)
     assert (len(fitted), len(held_out)) == (4, 2)
     assert resolve_rollouts([recording])[1] is None
