@@ -33,16 +33,19 @@ def versions() -> dict[str, str]:
 
 
 def model_name(model: Any) -> str:
-    """Returns the name of a model with what is attached to it; the same in every process."""
+    """Returns the name of a model with what is attached to it; the same in every process.
+
+    A function called ``model`` has the name of its Python file: so are all models called that are
+    derived from a robot's file, and their files have the robot's name.
+    """
     if _is_wrapped(model):
         return model_name(model.args[-1])
     if isinstance(model, ModelWithEffects | ModelWithFinerSteps | ModelWithWiderPriors):
-        return repr(model)
+        return repr(model).replace(model.__name__, model_name(model.base), 1)
     name = getattr(model, "__name__", type(model).__name__)
-    # Every model that is derived from a robot's file is called so; its own file is called as the
-    # robot's.
     code = getattr(model, "__code__", None)
-    return Path(code.co_filename).stem if name == "model" and code is not None else name
+    file = Path("" if code is None else code.co_filename)
+    return file.stem if name == "model" and file.suffix == ".py" and file.is_file() else name
 
 
 def source_text(model: Any) -> str:

@@ -3,7 +3,7 @@
 import npdr_ppl as npdr
 from npdr_ppl.cli.model_files import load_function
 from npdr_ppl.model_identity import file_text, model_name
-from npdr_ppl.models.effects import CoulombFriction
+from npdr_ppl.models.effects import Bias, CoulombFriction
 from npdr_ppl.models.pendulum import pendulum
 
 
@@ -22,4 +22,7 @@ def test_the_file_of_a_model_is_found_under_what_wraps_it():
 
 def test_a_function_called_model_has_the_name_of_its_file(tmp_path):
     (tmp_path / "arm.py").write_text("def model(inputs):\n    pass\n")
-    assert model_name(load_function(tmp_path / "arm.py", "model")) == "arm"
+    model = load_function(tmp_path / "arm.py", "model")
+    assert model_name(model) == "arm"
+    rubbed = npdr.add_effect(npdr.add_effect(model, CoulombFriction("hinge")), Bias("hinge"))
+    assert model_name(rubbed) == "arm + hinge.coulomb_friction + hinge.bias"

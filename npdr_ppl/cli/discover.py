@@ -65,7 +65,8 @@ def discover(
     candidates: Annotated[
         list[str] | None,
         typer.Option(
-            help="Effects to try, in the form of --effect; the catalogue if not given.",
+            help="Effects to try, in the form of --effect; the catalogue if not given. Repeat the "
+            "option, or separate by commas.",
             autocompletion=complete_effect,
         ),
     ] = None,
@@ -143,8 +144,9 @@ def discover(
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     options = data_options(None, segment_length, initial_state, precision, noise, strict)
+    named = [word for word in candidates or () if word]
     search = DiscoveryOptions(
-        effects=tuple(named_effects(candidates)) if candidates else None,
+        effects=tuple(named_effects(named)) or None,
         max_effects=max_effects,
         false_alarm_rate=false_alarm_rate,
         repeat=repeat,

@@ -238,11 +238,13 @@ class Inputs:
     def earlier(self, name: str, steps: Tensor) -> Tensor | None:
         """Returns measurements of a channel before the segments, ``(M, S)``.
 
-        Before its rollout began, a channel had the value of the first measurement.
+        Before its rollout began, a channel had the value of the first measurement. Beyond the
+        longest rollout's end it has the last one.
 
         Args:
             name: The channel.
-            steps: How many steps before the segments' starts, ``(M,)`` or ``(M, S)``.
+            steps: How many steps before the segments' starts, ``(M,)`` or ``(M, S)``; negative
+                ones are after.
 
         Returns:
             ``None`` if they are unknown.

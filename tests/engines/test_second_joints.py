@@ -11,14 +11,22 @@ from scipy.integrate import solve_ivp
 
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.screening.variants import candidates_at
-from npdr_ppl.engines.mujoco import MujocoSimulator
+from npdr_ppl.engines.mujoco import MujocoSimulator, open_loop
+from npdr_ppl.engines.mujoco.carrier_past import carrier_past
 from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.engines.mujoco.randomised import randomised_fields
 from npdr_ppl.engines.mujoco.stepper import MujocoStepper
 from npdr_ppl.engines.mujoco.urdf_export import export_urdf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import BaseCompliance, CoulombFriction, InputDelay, candidate_effects
+from npdr_ppl.models.effects import (
+    BaseCompliance,
+    CoulombFriction,
+    InputDelay,
+    IntegralAction,
+    PeriodicDisturbance,
+    candidate_effects,
+)
 from npdr_ppl.models.pendulum import Pendulum
 from npdr_ppl.policies.linear import Linear
 from npdr_ppl.rollouts import Rollouts
@@ -157,30 +165,40 @@ def test_without_compliance_nothing_changes_by_more_than_rounding_errors(arm):
     assert attached.carrying(()).model is arm.model
 
 
-def recorded(joint, numbers, noise=0.0):
-    """Returns a recording by the equations, positions only."""
+def recorded(joint, numbers, noise=0.0, *, rates=False):
+    """Returns a recording by the equations: positions, with ``rates`` also velocities."""
     start = np.array([0.3, 0.2])
     positions = np.concatenate((start[None], by_equations(joint, *numbers)))
     positions += noise * np.random.default_rng(0).standard_normal(positions.shape)
+    names = ("shoulder", "elbow")
+    if rates:
+        positions = np.concatenate((positions, np.gradient(positions, STEP, axis=0)), axis=1)
+        names = (*names, "shoulder_velocity", "elbow_velocity")
     return Rollouts(
         [positions],
         [goals(start)],
-        channel_names=("shoulder", "elbow"),
+        channel_names=names,
         action_names=("upper_goal", "lower_goal"),
         time_step=STEP,
     )
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-4])
 @pytest.mark.parametrize(
     ("joint", "port", "numbers"),
     [(0, "shoulder_torque", (0.01, 0.03, 0.1)), (1, "elbow_torque", (0.02, 0.03, 0.2))],
 )
-def test_a_carrier_swings_on_from_segment_to_segment(arm, joint, port, numbers, noise):
+@pytest.mark.parametrize(
+    ("noise", "rates", "history", "left"),
+    [(0.0, False, None, 0.12), (1e-4, False, None, 0.12), (1e-4, True, 50, 0.2)],
+)
+def test_a_carrier_swings_on_from_segment_to_segment(
+    arm, joint, port, numbers, noise, rates, history, left
+):
     effect = BaseCompliance(port)
     attached = arm.with_finer_steps().with_effects(effect)
     wanted = torch.tensor(recorded(joint, numbers).readings[0][1:]).reshape(-1, 20, 2)
-    inputs = recorded(joint, numbers, noise).inputs(segment_length=20)
+    recording = recorded(joint, numbers, noise, rates=rates)
+    inputs = recording.inputs(segment_length=20, history=history)
 
     def errors(inputs):
         found = attached.simulate(values_of(effect, numbers), inputs)[..., :2]
@@ -189,7 +207,65 @@ def test_a_carrier_swings_on_from_segment_to_segment(arm, joint, port, numbers, 
     swings = errors(inputs)
     begins_at_rest = errors(replace(inputs, recorded_readings=None))
     assert swings[0] == begins_at_rest[0]
-    assert float(swings[1:].mean().sqrt()) < 0.12 * float(begins_at_rest[1:].mean().sqrt())
+    assert float(swings[1:].mean().sqrt()) < left * float(begins_at_rest[1:].mean().sqrt())
+
+
+@pytest.mark.parametrize("rates", [False, True])
+def test_the_past_begins_where_the_recording_was(arm, rates):
+    inputs = recorded(1, SOFT, rates=rates).inputs(segment_length=20, history=30)
+    attached = arm.with_effects(BaseCompliance("elbow_torque"))
+    shape = torch.Size((inputs.num_segments,))
+    past = carrier_past(attached, inputs, shape, attached.initial_states(inputs))
+    assert past.lengths.tolist() == [0, 20, 30, 30, 30, 30]
+    positions = recorded(1, SOFT).readings[0]
+    begin = (inputs.start - past.lengths)[1:].numpy()
+    for joint in range(2):
+        assert past.states[joint][1:].numpy() == pytest.approx(positions[begin, joint], abs=3e-3)
+        rate = np.gradient(positions[:, joint], STEP, edge_order=2)[begin]
+        assert past.states[2 + joint][1:].numpy() == pytest.approx(rate, abs=0.3)
+
+
+def test_a_rigid_carrier_changes_nothing_after_a_past_either(arm):
+    inputs = recorded(1, SOFT).inputs(segment_length=20)
+    attached = arm.with_effects(BaseCompliance("shoulder_torque"))
+    difference = attached.simulate({}, inputs) - arm.simulate({}, inputs)
+    assert float(difference.abs().max()) < 1e-9
+
+
+def test_a_segment_does_not_depend_on_those_that_it_is_simulated_with(arm):
+    carrier, integral = BaseCompliance("elbow_torque"), IntegralAction("lower_goal")
+    attached = arm.with_effects(carrier, integral, PeriodicDisturbance("elbow_torque"))
+    numbers = values_of(carrier, SOFT) | {f"{integral.name}.rate": torch.tensor(2.0).double()}
+    for name, value in (("sine", 0.5), ("frequency", 2.0)):
+        numbers[f"elbow_torque.periodic_disturbance.{name}"] = torch.tensor(value).double()
+    inputs = recorded(1, SOFT).inputs(segment_length=20)
+    together = attached.simulate(numbers, inputs)
+    for k in range(inputs.num_segments):
+        alone = attached.simulate(numbers, inputs.segments([k]))
+        assert float((alone[0] - together[k]).abs().max()) < 1e-9
+
+
+def test_segments_of_a_past_that_diverges_begin_at_rest(arm, monkeypatch):
+    inputs = recorded(1, SOFT).inputs(segment_length=20)
+    attached = arm.with_effects(BaseCompliance("elbow_torque"))
+    numbers = values_of(attached.effects[0], SOFT)
+    resting = attached.simulate(numbers, replace(inputs, recorded_readings=None))
+
+    def wild(*arguments):
+        past = carrier_past(*arguments)
+        return past._replace(states=tuple(1e12 + 0.0 * state for state in past.states))
+
+    monkeypatch.setattr(open_loop, "carrier_past", wild)
+    assert float((attached.simulate(numbers, inputs) - resting).abs().max()) < 1e-9
+
+
+def test_commands_may_have_further_axes_than_those_before_them(arm):
+    inputs = recorded(1, SOFT).inputs(segment_length=20)
+    several = replace(inputs, actions=inputs.actions + torch.zeros(3, 1, 1, 1))
+    for simulator in (arm, arm.with_effects(BaseCompliance("elbow_torque"))):
+        found = simulator.simulate({}, several)
+        assert found.shape == (3, 6, 20, 4)
+        assert torch.equal(found[1], simulator.simulate({}, inputs))
 
 
 def test_the_past_of_a_carrier_passes_through_the_effects_on_commands(arm):

@@ -201,7 +201,7 @@ def after_past_commands(
     *,
     until: int = 0,
 ) -> State:
-    """Returns the same as :func:`with_past_commands`, from each simulation's own commands.
+    """Does the same as :func:`with_past_commands`, from each simulation's own commands.
 
     Args:
         chain: The effects.
@@ -209,7 +209,7 @@ def after_past_commands(
         tables: The effects' parameters.
         records: Commands of each action channel.
         num_steps: Number of past steps that were recorded.
-        until: The step, of which 0 is the segment's first, before which to stop.
+        until: The step before which to stop; the segment's first step is 0.
     """
     for step in range(-num_steps, until):
         state, _, _ = chain.actions.act_on_record(state, records, step, tables)

@@ -95,7 +95,7 @@ class _Replay:
         self.columns = [inputs.action_names.index(a.name) for a in simulator.actions]
         self.limits = [(a.lower, a.upper) for a in simulator.actions]
         self.start = recorded_start(simulator, inputs, shape)
-        self.carriers = carrier_past(simulator, inputs, shape)
+        self.carriers = carrier_past(simulator, inputs, shape, self.start.states)
         self.commands, self.rows = self._commands(shape)
         self.histories = simulator.histories(given, inputs.time_step)
 
@@ -103,7 +103,8 @@ class _Replay:
     def chunk_size(self) -> int:
         """Number of simulations that run together."""
         model = self.simulator.model
-        num_steps = self.inputs.num_steps * self.simulator.num_substeps(self.inputs.time_step)
+        num_steps = self.inputs.num_steps + self.carriers.num_steps
+        num_steps *= self.simulator.num_substeps(self.inputs.time_step)
         width = 1 + model.nq + model.nv + model.nu + model.nsensordata
         return max(1, CHUNK_BYTES // (8 * width * (num_steps + 1)))
 
@@ -150,7 +151,7 @@ class _Replay:
             if self.simulator.second_joints:
                 carriers = self.carriers.part(first, last)
                 until = torch.from_numpy(controls[:, : carriers.num_steps + 1])
-                carriers.settle(chain, state, tables, until, components)
+                carriers.replay(chain, state, tables, until, components, recorded.time)
                 controls = controls[:, carriers.num_steps :]
                 chain.begin()
             if chain.has_forces:
@@ -169,12 +170,15 @@ class _Replay:
     def _commands(self, shape: torch.Size) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Returns limited commands, ``(rows, steps, actions)``, and the row of each simulation.
 
-        There is one row per segment, which many simulations share. They begin with the past steps
-        that carriers need.
+        There is one row per segment, which many simulations share. The steps begin with the past
+        ones that carriers need.
         """
-        past = self.inputs.past_actions
-        past = past[..., past.shape[-2] - self.carriers.num_steps :, :]
-        actions = torch.cat((past, self.inputs.actions), dim=-2)[..., self.columns]
+        actions = self.inputs.actions[..., self.columns]
+        if num_past := self.carriers.num_steps:
+            past = self.inputs.past_actions[..., -num_past:, self.columns]
+            axes = torch.broadcast_shapes(past.shape[:-2], actions.shape[:-2])
+            both = (value.expand(*axes, *value.shape[-2:]) for value in (past, actions))
+            actions = torch.cat(tuple(both), dim=-2)
         lower, upper = torch.tensor(self.limits, dtype=torch.float64).reshape(-1, 2).unbind(-1)
         commands = actions.clamp(lower, upper).numpy()
         segments, num_rows = commands.shape[:-2], math.prod(commands.shape[:-2])
@@ -211,7 +215,7 @@ class _Replay:
     ) -> NDArray[np.float64]:
         """Returns actions after all effects, ``(n, steps, engine steps per step, actions)``.
 
-        Without action effects, the third axis has size 1. They begin with the past steps that
+        Without action effects, the third axis has size 1. The steps begin with the past ones that
         carriers need.
         """
         rows = self.rows[first:last]

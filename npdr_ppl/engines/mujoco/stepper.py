@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.common.chain_state import Moments, State, Tables
@@ -81,6 +82,11 @@ class MujocoStepper(EffectChain):
         self._has_accelerations = ACCELERATION_STAGE in stages
         self._applied = state_view(batch, "qfrc_applied") if self.forces.effects else None
         self._seconds = tuple(simulator.second_joints.values())
+        # Indices in qpos and qvel of all that is no second joint.
+        self._first_columns = (
+            np.setdiff1d(np.arange(simulator.model.nq), [s.position for s in self._seconds]),
+            np.setdiff1d(np.arange(simulator.model.nv), [s.velocity for s in self._seconds]),
+        )
         if self._seconds:
             # What is bound later has no values until the engine computes once more.
             self._accelerations, self._passive, self._bias = (
@@ -111,7 +117,7 @@ class MujocoStepper(EffectChain):
         return super().start(*args, **kwargs)._replace(servo_memory=self._servos.initial_memory())
 
     def place(self, components: Components, chosen: Tensor | None = None) -> None:
-        """Sets the simulations' states and their time to zero; second joints stay as they are.
+        """Sets the simulations' states; second joints stay as they are.
 
         What is no component of the state gets the simulator's initial position, and rests.
 
@@ -119,17 +125,31 @@ class MujocoStepper(EffectChain):
             components: Components of the simulator's state, ``(N,)`` each.
             chosen: Which simulations to set, a mask ``(N,)``; by default all.
         """
-        positions = np.tile(self.simulator.initial_positions, (len(self._qpos), 1))
-        rates = np.zeros_like(self._qvel)
+        rows = self._rows(chosen)[:, None]
+        positions, rates = self._first_columns
+        self._qpos[rows, positions] = self.simulator.initial_positions[positions]
+        self._qvel[rows, rates] = 0.0
         for component, value in zip(self.simulator.components, components, strict=True):
-            where = rates if component.is_velocity else positions
-            where[:, component.address] = value.numpy()
-        for second in self._seconds:
-            positions[:, second.position] = self._qpos[:, second.position]
-            rates[:, second.velocity] = self._qvel[:, second.velocity]
-        rows = slice(None) if chosen is None else chosen.numpy()
-        self._qpos[rows], self._qvel[rows] = positions[rows], rates[rows]
-        state_view(self._batch, "time")[rows] = 0.0
+            where = self._qvel if component.is_velocity else self._qpos
+            where[rows, component.address] = value.numpy()[rows]
+
+    def restart(self, components: Components, chosen: Tensor | None = None) -> None:
+        """Sets states as :meth:`place` does, and forgets what else the simulations went through.
+
+        Args:
+            components: Components of the simulator's state, ``(N,)`` each.
+            chosen: Which simulations to set, a mask ``(N,)``; by default all.
+        """
+        self.place(components, chosen)
+        rows = self._rows(chosen)
+        for name in ("time", "act", "warmstart"):
+            state_view(self._batch, name)[rows] = 0.0
+        self._batch.warning[rows] = 0
+        self.is_lost[torch.from_numpy(rows)] = False
+
+    def _rows(self, chosen: Tensor | None) -> NDArray[np.int64]:
+        """Returns the numbers of the chosen simulations, or of all."""
+        return np.arange(len(self._qpos)) if chosen is None else chosen.numpy().nonzero()[0]
 
     def settle(
         self,
@@ -148,7 +168,9 @@ class MujocoStepper(EffectChain):
         """
         if not self._seconds:
             return
-        rows = np.arange(len(self._qpos)) if chosen is None else chosen.numpy().nonzero()[0]
+        rows = self._rows(chosen)
+        if not len(rows):
+            return
         places = [second.position for second in self._seconds]
         at = [second.velocity for second in self._seconds]
         self._qpos[rows[:, None], places] = self._qvel[rows[:, None], at] = 0.0
