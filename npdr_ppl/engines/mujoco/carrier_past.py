@@ -15,8 +15,8 @@ from npdr_ppl.language.inputs import Inputs
 __all__ = ["CarrierPast", "carrier_past"]
 
 _SECONDS = 1.0
-"""How long the past is simulated. On an arm whose carrier swings for seconds, it leaves less than an
-eighth of the error of carriers at rest (``tests/engines/test_second_joints.py``)."""
+"""How long the past is simulated. On an arm whose carrier swings for seconds, an eighth of the
+error of carriers that begin at rest is left (``tests/engines/test_second_joints.py``)."""
 
 _SAMPLES_PER_SIDE = 2
 """Samples on each side of a moment, from which its state is estimated."""
