@@ -203,13 +203,7 @@ def after_past_commands(
 ) -> State:
     """Does the same as :func:`with_past_commands`, from each simulation's own commands.
 
-    Args:
-        chain: The effects.
-        state: State at the start of the segments, as if the oldest command had been constant.
-        tables: The effects' parameters.
-        records: Commands of each action channel.
-        num_steps: Number of past steps that were recorded.
-        until: The step before which to stop; the segment's first step is 0.
+    It stops before the step ``until``; the segment's first step is 0.
     """
     for step in range(-num_steps, until):
         state, _, _ = chain.actions.act_on_record(state, records, step, tables)
