@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from hidden_rigs import make_case
 
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import screen
-from npdr_ppl.discovery.screening.sensitivities import sensitivities
+from npdr_ppl.discovery.screening.sensitivities import _between_unlike, sensitivities
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import (
@@ -68,3 +69,31 @@ def test_sizes_of_a_resonance_that_change_the_motion_alike_are_left_out(quiet, m
     # Each size stands for those up to the next ones that were tried, so none is excluded.
     ends = [(float(v.lower), float(v.upper)) for v in few]
     assert all(one[1] >= other[0] for one, other in zip(ends, ends[1:], strict=False))
+
+
+def test_nothing_is_tried_between_sizes_of_a_resonance_that_cannot_explain_the_residuals():
+    east, north = torch.eye(2, dtype=torch.float64)
+    largest = 100.0
+    assert _between_unlike({0: 50.0 * east, 4: 50.0 * north}, largest) == [2]
+    # One of the two may explain them, and so may a size between them.
+    assert _between_unlike({0: 50.0 * east, 4: 500.0 * north}, largest) == [2]
+    assert _between_unlike({0: 200.0 * east, 4: 500.0 * north}, largest) == []
+    # A simulation that diverges explains nothing.
+    assert _between_unlike({0: 200.0 * east, 4: torch.nan * north}, largest) == []
+    assert _between_unlike({0: 50.0 * east, 4: torch.nan * north}, largest) == [2]
+    # No recording tells these two apart.
+    assert _between_unlike({0: 0.6 * east, 4: 0.6 * north}, largest) == []
+    assert _between_unlike({0: 50.0 * east, 4: 51.0 * east}, largest) == []
+    assert _between_unlike({3: 50.0 * east, 4: 50.0 * north}, largest) == []
+
+
+def test_a_resonance_that_explains_the_residuals_is_found_among_fewer_sizes():
+    hidden = [("carriage", "joint_elasticity")]
+    case = make_case("emps", "one", hidden, strength=0.3, seed=2001)
+    fitted = fit_hypothesis(case.model, case.fit, segment_options(case.fit))
+    projection, effects = Projection(fitted), (JointElasticity("carriage"),)
+    every = list(sensitivities(fitted, effects))
+    few = list(sensitivities(fitted, effects, projection=projection))
+    (best,), (best_of_all,) = screen(projection, few), screen(projection, every)
+    assert best.gain == pytest.approx(best_of_all.gain)
+    assert len(few) < len(every)

@@ -16,8 +16,9 @@ segments but not within one. So the variance of a score is estimated from the sc
 segments' sums (Liang & Zeger 1986), never from the number of terms.
 """
 
+import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -83,6 +84,14 @@ class Projection:
         prior = torch.eye(by_z.shape[-1], dtype=torch.float64)
         self._information = (by_z.mT @ self._weights).sum(0) + prior
         self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
+
+    def bare(self) -> "Projection":
+        """Returns a copy without cached results, which need not be sent to another process."""
+        other = copy.copy(self)
+        for name in ("num_measured", "_starts_by_size", "whitened_parameters", "misfit"):
+            other.__dict__.pop(name, None)
+        other.hypothesis = replace(self.hypothesis)
+        return other
 
     @cached_property
     def num_measured(self) -> Tensor:

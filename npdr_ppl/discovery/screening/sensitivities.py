@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
+from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.pooled.pool_simulator import PooledSimulator
 from npdr_ppl.errors import ModelError
@@ -72,6 +73,7 @@ def sensitivities(
     hypothesis: Hypothesis,
     effects: tuple[Effect, ...],
     hints: Mapping[str, Mapping[str, float]] | None = None,
+    projection: Projection | None = None,
 ) -> Iterator[Variant]:
     """Yields the change from each effect, in each shape and size.
 
@@ -82,6 +84,8 @@ def sensitivities(
         hypothesis: The fitted model that the effects would be added to.
         effects: The candidates.
         hints: Additional shapes to try, by effect's name: values of its parameters.
+        projection: The fitted model's residuals, if sizes of a resonance that cannot explain them
+            are of no use.
     """
     fit, own = hypothesis.fit, hypothesis.segments
     segments = own.in_coarser_steps(fit.z, fit.offsets)
@@ -110,7 +114,7 @@ def sensitivities(
 
     for group in _groups(probes, box.simulator, segments):
         if group[0].effect.is_resonant:
-            group, parts = _at_telling_sizes(group, changed)
+            group, parts = _at_telling_sizes(group, changed, projection)
         else:
             parts = changed(group)
         for probe, rows in zip(group, parts, strict=True):
@@ -118,27 +122,38 @@ def sensitivities(
 
 
 def _at_telling_sizes(
-    group: "list[_Probe]", changed: "Callable[[list[_Probe]], list[Tensor]]"
+    group: "list[_Probe]",
+    changed: "Callable[[list[_Probe]], list[Tensor]]",
+    projection: Projection | None,
 ) -> "tuple[list[_Probe], list[Tensor]]":
     """Returns the probes with as many of their sizes as differ, and their changes.
 
     Far from the frequencies of the motion, neighbouring resonances change it alike. Between two
-    sizes that do not, the one in the middle is tried, and so on.
+    sizes that do not, the one in the middle is tried, and so on. Nothing is tried between two that
+    no recording tells apart, and between two whose changes are too large to explain the residuals,
+    as those of a joint so soft that its servo is unstable.
 
     Args:
         group: Probes of resonances with all their sizes, which ascend.
         changed: Returns the changes of the whitened measurements by each run of probes.
+        projection: The residuals to be explained; ``None`` if sizes only have to differ.
     """
     num = len(group[0].cases)
     found: list[dict[int, Tensor]] = [{} for _ in group]
+    left: list[dict[int, Tensor]] = [{} for _ in group]
     waiting = [sorted({*range(0, num, SENSITIVITY.resonance_stride), num - 1}) for _ in group]
     while any(waiting):
         asked = [probe.at(cases) for probe, cases in zip(group, waiting, strict=True) if cases]
         rows = iter(changed(asked))
-        for probe, cases, known in zip(group, waiting, found, strict=True):
+        for k, (probe, cases) in enumerate(zip(group, waiting, strict=True)):
             if cases:
-                known |= dict(zip(cases, next(rows).split(len(probe.strengths)), strict=True))
-        waiting = [_between_unlike(known) for known in found]
+                parts = next(rows).split(len(probe.strengths))
+                found[k] |= dict(zip(cases, parts, strict=True))
+                left[k] |= {
+                    c: _left(part, projection) for c, part in zip(cases, parts, strict=True)
+                }
+        largest = math.inf if projection is None else _largest(projection)
+        waiting = [_between_unlike(each, largest) for each in left]
     chosen = [sorted(known) for known in found]
     return (
         [probe.at(cases) for probe, cases in zip(group, chosen, strict=True)],
@@ -146,13 +161,38 @@ def _at_telling_sizes(
     )
 
 
-def _between_unlike(known: Mapping[int, Tensor]) -> list[int]:
-    """Returns the middles between neighbouring sizes whose changes are not proportional."""
+def _left(change: Tensor, projection: Projection | None) -> Tensor:
+    """Returns what initial states and parameters leave of a change ``(k, S, N)``, flat."""
+    if projection is not None:
+        change = projection.projected(change.permute(1, 2, 0))
+    return change.flatten()
+
+
+def _largest(projection: Projection) -> float:
+    """Returns the size of a change above which every multiple that stands for it fits worse.
+
+    The misfit |r − m x|² of a change x exceeds |r|² for all m above 2 |r| / |x|, whatever its
+    direction.
+    """
+    return 2.0 * SENSITIVITY.resonance_ratio * math.sqrt(projection.misfit)
+
+
+def _between_unlike(known: Mapping[int, Tensor], largest: float) -> list[int]:
+    """Returns the middles between neighbouring sizes that differ, unless both are too large.
+
+    Args:
+        known: Changes of the whitened measurements by sizes.
+        largest: Size of a change that is too large to explain anything.
+    """
     middles = []
     for one, other in itertools.pairwise(sorted(known)):
-        a, b = known[one].flatten(), known[other].flatten()
-        likeness = (a @ b) / (a.norm() * b.norm()).clamp_min(1e-300)
-        if other - one > 1 and not float(likeness) >= SENSITIVITY.alike:
+        a, b = known[one], known[other]
+        sizes = a.norm(), b.norm()
+        likeness = (a @ b) / (sizes[0] * sizes[1]).clamp_min(1e-300)
+        # Changes that are less than one standard deviation apart are not told apart.
+        is_alike = float(likeness) >= SENSITIVITY.alike or float((a - b).norm()) < 1.0
+        is_useful = float(torch.stack(sizes).nan_to_num(math.inf).min()) < largest
+        if other - one > 1 and is_useful and not is_alike:
             middles.append((one + other) // 2)
     return middles
 

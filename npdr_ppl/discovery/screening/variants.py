@@ -96,7 +96,7 @@ def variants_of(
             if step is not None:
                 hints[effect.name] = {effect.rounds: step}
     candidates, numbered = _with_ripples(candidates, projection, found)
-    for variant in _in_all_shapes(hypothesis, candidates, hints, number):
+    for variant in _in_all_shapes(projection, candidates, hints, number):
         yield replace(variant, is_hinted=True) if variant.effect.name in numbered else variant
 
 
@@ -117,25 +117,32 @@ def _with_ripples(
 
 
 def _in_all_shapes(
-    hypothesis: Hypothesis,
+    projection: Projection,
     candidates: tuple[Effect, ...],
     hints: Mapping[str, Mapping[str, float]],
     number: int | None,
 ) -> Iterator[Variant]:
     """Yields the candidates in all shapes and sizes, from several processes if there are any."""
+    hypothesis = projection.hypothesis
     number = number or num_processes(hypothesis.simulator)
     if number == 1:
-        yield from sensitivities(hypothesis, candidates, hints)
+        yield from sensitivities(hypothesis, candidates, hints, projection)
         return
     # Every part holds effects of every kind.
     num_parts = min(len(candidates), PARTS_PER_PROCESS * number)
     parts = [candidates[k::num_parts] for k in range(num_parts)]
-    bare = replace(hypothesis)  # without cached results, which need not be sent
-    for part in side_by_side(partial(_listed, bare, hints=hints), parts, number):
+    bare = projection.bare()
+    # A resonance needs the residuals; they are large.
+    sent = bare if any(effect.is_resonant for effect in candidates) else None
+    listed = partial(_listed, bare.hypothesis, hints=hints, projection=sent)
+    for part in side_by_side(listed, parts, number):
         yield from part
 
 
 def _listed(
-    hypothesis: Hypothesis, effects: tuple[Effect, ...], hints: Mapping[str, Mapping[str, float]]
+    hypothesis: Hypothesis,
+    effects: tuple[Effect, ...],
+    hints: Mapping[str, Mapping[str, float]],
+    projection: Projection | None,
 ) -> list[Variant]:
-    return list(sensitivities(hypothesis, effects, hints))
+    return list(sensitivities(hypothesis, effects, hints, projection))
