@@ -276,6 +276,19 @@ def test_episodes_become_rollouts_though_their_time_begins_anew():
     assert len(Rollouts.from_dataframe(frame.rename(columns={"lap": "episode"}), chosen)) == 2
 
 
+def test_a_column_that_counts_up_as_the_time_begins_anew_marks_rollouts():
+    frame = pd.DataFrame({"lap": [3] * 9 + [4] * 9, "t": [*TIME, *TIME], "a": np.arange(18.0)})
+    rollouts = Rollouts.from_dataframe(frame, mapping_of("a"))
+    assert len(rollouts) == 2
+    assert "the time begins anew with each 'lap'; each is a rollout." in rollouts.notes
+    # A column that changes elsewhere, too, or by half a step, is something else.
+    for other in ([3] * 8 + [4] * 10, [3] * 5 + [4] * 4 + [5] * 9, [3] * 9 + [3.5] * 9):
+        assert len(Rollouts.from_dataframe(frame.assign(lap=other), mapping_of("a"))) == 1
+    # Nothing begins anew.
+    later = [*TIME, *(TIME + TIME[-1] + 1.0)]
+    assert len(Rollouts.from_dataframe(frame.assign(t=later), mapping_of("a"))) == 1
+
+
 def test_words_for_missing_values(tmp_path):
     (tmp_path / "x.csv").write_text("t,a,b\n0,1,nan\n1,NaN,inf\n2,,-Inf\n3,4,2\n4,N/A,true\n")
     signals = read_log(tmp_path / "x.csv").by_name

@@ -144,6 +144,10 @@ def log_of_columns(
         told = rollout_checks.shown(", ".join(skipped), 200)
         notes.append(Remark(f"{about}text was left out: {told}."))
     episodes = settings.episodes or next((n for n in EPISODE_NAMES if n in numbers), "")
+    if not episodes and (counter := _counter_of_restarts(time, numbers)):
+        episodes = counter
+        told = rollout_checks.shown(counter)
+        notes.append(Remark(f"{about}the time begins anew with each {told}; each is a rollout."))
     if episodes in numbers:
         time = _continued(time, numbers[episodes])
     stamps: dict[str, Array] = {}
@@ -256,6 +260,27 @@ def _stamps(
         else:
             different[name] = difference
     return found, different
+
+
+def _counter_of_restarts(time: Array, numbers: Mapping[str, Array]) -> str:
+    """Returns the column that counts up wherever the time goes back, and only there.
+
+    Args:
+        time: Time stamps in s, ``(N,)``.
+        numbers: The columns, ``(N,)`` each.
+
+    Returns:
+        Its name; ``""`` if there is none, or if the time never goes back.
+    """
+    restarts = np.diff(time) < 0
+    if not restarts.any():
+        return ""
+    for name, values in numbers.items():
+        steps = np.diff(values)
+        if np.array_equal(steps > 0, restarts) and np.array_equal(steps != 0, restarts):
+            if (values == np.round(values)).all():
+                return name
+    return ""
 
 
 def _continued(time: Array, episodes: Array) -> Array:
