@@ -501,3 +501,16 @@ def test_a_robot_that_stands_still_is_not_taken_for_a_bomb(tmp_path):
     # large enough for the free ones not to matter.
     assert 2_000 * 30 < 4 * size
     assert len(read_log(tmp_path / "log.mcap").signals) == 21
+
+
+def test_tables_of_a_folder_begin_anew_together(tmp_path):
+    folder = tmp_path / "log"
+    folder.mkdir()
+    twice = [*np.arange(COUNT) * 0.01] * 2
+    both = {"t": twice, "angle": np.arange(2 * COUNT)}
+    # Only one of the tables counts its runs.
+    runs = np.repeat([0, 1], COUNT)
+    pd.DataFrame(both | {"run": runs, "episode": runs}).to_csv(folder / "arm.csv", index=False)
+    pd.DataFrame(both).to_csv(folder / "hand.csv", index=False)
+    log = read_log(folder).by_name
+    assert np.array_equal(log["arm/angle"].time, log["hand/angle"].time)

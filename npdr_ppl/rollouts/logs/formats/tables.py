@@ -97,7 +97,8 @@ def log_of_columns(
         source: Name of the file, for messages.
         columns: The columns, of equal length.
         settings: Which column holds the time stamps, and their unit.
-        prefix: Text in front of each signal's name.
+        prefix: Text in front of each signal's name, if other tables share the clock: then no column
+            marks episodes here.
         components: Names of the components of vectors: by column, or one list for all vectors of
             its length. Other vectors number their components from 0.
         units: Units by column.
@@ -143,11 +144,7 @@ def log_of_columns(
     if skipped:
         told = rollout_checks.shown(", ".join(skipped), 200)
         notes.append(Remark(f"{about}text was left out: {told}."))
-    episodes = settings.episodes or next((n for n in EPISODE_NAMES if n in numbers), "")
-    if not episodes and (counter := _counter_of_restarts(time, numbers)):
-        episodes = counter
-        told = rollout_checks.shown(counter)
-        notes.append(Remark(f"{about}the time begins anew with each {told}; each is a rollout."))
+    episodes = "" if prefix else _episodes(time, numbers, settings, notes)
     if episodes in numbers:
         time = _continued(time, numbers[episodes])
     stamps: dict[str, Array] = {}
@@ -178,9 +175,7 @@ def log_of_columns(
     notes += [
         Remark(f"the signals beside {rollout_checks.shown(s)} have its time.") for s in stamps
     ]
-    return Log(
-        source, tuple(signals), tuple(notes), f"{prefix}{episodes}" if episodes in numbers else ""
-    )
+    return Log(source, tuple(signals), tuple(notes), episodes if episodes in numbers else "")
 
 
 def _with_joined_stamps(columns: Columns) -> Columns:
@@ -260,6 +255,27 @@ def _stamps(
         else:
             different[name] = difference
     return found, different
+
+
+def _episodes(
+    time: Array, numbers: Mapping[str, Array], settings: LogSettings, notes: list[str]
+) -> str:
+    """Returns the column whose every change begins a new episode; ``""`` if there is none.
+
+    Args:
+        time: Time stamps in s, ``(N,)``.
+        numbers: The columns, ``(N,)`` each.
+        settings: They may name the column.
+        notes: A remark is added if only the time tells.
+    """
+    named = settings.episodes or next((n for n in EPISODE_NAMES if n in numbers), "")
+    if named:
+        return named
+    counter = _counter_of_restarts(time, numbers)
+    if counter:
+        told = rollout_checks.shown(counter)
+        notes.append(Remark(f"the time begins anew with each {told}; each is a rollout."))
+    return counter
 
 
 def _counter_of_restarts(time: Array, numbers: Mapping[str, Array]) -> str:
