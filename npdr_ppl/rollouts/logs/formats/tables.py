@@ -97,8 +97,8 @@ def log_of_columns(
         source: Name of the file, for messages.
         columns: The columns, of equal length.
         settings: Which column holds the time stamps, and their unit.
-        prefix: Text in front of each signal's name, if other tables share the clock: then no column
-            marks episodes here.
+        prefix: Text in front of each signal's name, if other tables share the clock. Then no
+            column marks episodes here.
         components: Names of the components of vectors: by column, or one list for all vectors of
             its length. Other vectors number their components from 0.
         units: Units by column.
