@@ -10,7 +10,7 @@ from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.sampling import MOST_BRIDGED
 from npdr_ppl.rollouts.tracks import LARGEST, REGULAR_SHARE, usual_step
 
-__all__ = ["Jumps", "stamp_notes", "without_jumps"]
+__all__ = ["Jumps", "restarts", "stamp_notes", "without_jumps"]
 
 LONGEST_PAUSE = 10_000
 """Longest pause, in usual steps of the fastest channel, that stays as long as it is. A longer one
@@ -192,14 +192,23 @@ def _without_restarts(times: Sequence[Array], num_channels: int) -> tuple[Sequen
 
 def _between_restarts(time: Array) -> list[Array]:
     """Splits time stamps where the clock went back."""
+    begins = restarts(time)
+    return np.split(time, begins) if len(begins) else [time]
+
+
+def restarts(time: Array) -> NDArray[np.intp]:
+    """Returns the indices of the first time stamps after the clock went back.
+
+    It went back if a stamp lies more than ``MOST_BRIDGED`` usual steps before the last one, unless
+    the next stamp goes on from the last one: then a single message was late.
+    """
     known = np.flatnonzero(np.isfinite(time))
     stamps = time[known]
     steps = np.diff(stamps)
     if not (steps < 0).any() or not (steps > 0).any():
-        return [time]
+        return np.empty(0, dtype=np.intp)
     back = np.flatnonzero(steps[:-1] < -MOST_BRIDGED * _usual(time))
-    # After a single late message the clock is where it was before.
-    return np.split(time, known[back[stamps[back + 2] <= stamps[back]] + 1])
+    return known[back[stamps[back + 2] <= stamps[back]] + 1]
 
 
 # -- Pauses ------------------------------------------------------------------------------------

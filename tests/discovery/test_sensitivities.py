@@ -1,6 +1,8 @@
 """Sensitivities of the measurements to candidate effects."""
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -71,20 +73,42 @@ def test_sizes_of_a_resonance_that_change_the_motion_alike_are_left_out(quiet, m
     assert all(one[1] >= other[0] for one, other in zip(ends, ends[1:], strict=False))
 
 
-def test_nothing_is_tried_between_sizes_of_a_resonance_that_cannot_explain_the_residuals():
-    east, north = torch.eye(2, dtype=torch.float64)
-    largest = 100.0
-    assert _between_unlike({0: 50.0 * east, 4: 50.0 * north}, largest) == [2]
-    # One of the two may explain them, and so may a size between them.
-    assert _between_unlike({0: 50.0 * east, 4: 500.0 * north}, largest) == [2]
-    assert _between_unlike({0: 200.0 * east, 4: 500.0 * north}, largest) == []
-    # A simulation that diverges explains nothing.
-    assert _between_unlike({0: 200.0 * east, 4: torch.nan * north}, largest) == []
-    assert _between_unlike({0: 50.0 * east, 4: torch.nan * north}, largest) == [2]
-    # No recording tells these two apart.
-    assert _between_unlike({0: 0.6 * east, 4: 0.6 * north}, largest) == []
-    assert _between_unlike({0: 50.0 * east, 4: 51.0 * east}, largest) == []
-    assert _between_unlike({3: 50.0 * east, 4: 50.0 * north}, largest) == []
+def residuals(*values):
+    """A projection of residuals from which nothing is left out."""
+    residual = torch.tensor(values, dtype=torch.float64)
+
+    def scores(columns):
+        flat = columns.flatten(0, 1)
+        return SimpleNamespace(information=flat.mT @ flat, score=flat.mT @ residual)
+
+    return SimpleNamespace(misfit=float(residual @ residual), scores=scores)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "is_middle_tried"),
+    [
+        ((40.0, 0.0), (0.0, 40.0), True),
+        # One of the two may explain the residuals, and so may a size between them.
+        ((40.0, 0.0), (0.0, 500.0), True),
+        ((200.0, 0.0), (0.0, 500.0), False),
+        # The larger one stands for smaller sizes, too, whose change is two thirds of its own.
+        ((120.0, 0.0), (0.0, 140.0), True),
+        ((120.0, 0.0), (0.0, 150.0), False),
+        # A simulation that diverges explains nothing.
+        ((200.0, 0.0), (math.nan, 0.0), False),
+        ((40.0, 0.0), (math.nan, 0.0), True),
+        # Noise does not tell these two apart, and the residuals do only if they point there.
+        ((0.0, 0.6), (0.0, -0.3), False),
+        ((0.6, 0.0), (-0.3, 0.0), True),
+        ((40.0, 0.0), (41.0, 1.0), False),
+    ],
+)
+def test_sizes_of_a_resonance_that_cannot_tell_more_are_not_tried(one, other, is_middle_tried):
+    known = {k: torch.tensor([[c]], dtype=torch.float64) for k, c in ((0, one), (4, other))}
+    wanted = [2] if is_middle_tried else []
+    assert _between_unlike(known, residuals(50.0, 0.0)) == wanted
+    beside = {3: known[0], 4: known[4]}
+    assert _between_unlike(beside, residuals(50.0, 0.0)) == []
 
 
 def test_a_resonance_that_explains_the_residuals_is_found_among_fewer_sizes():
@@ -97,3 +121,14 @@ def test_a_resonance_that_explains_the_residuals_is_found_among_fewer_sizes():
     (best,), (best_of_all,) = screen(projection, few), screen(projection, every)
     assert best.gain == pytest.approx(best_of_all.gain)
     assert len(few) < len(every)
+
+
+def test_a_size_that_diverges_leaves_the_products_of_the_others(quiet):
+    projection = Projection(quiet)
+    (variant,) = sensitivities(quiet, (QuadraticDrag("hinge"),))
+    lost = torch.full_like(variant.change, math.nan)
+    alone, both = (
+        projection.scores(torch.cat(c, -1)) for c in ((variant.change,), (variant.change, lost))
+    )
+    assert both.information[0, 0] == pytest.approx(float(alone.information[0, 0]))
+    assert both.score[0] == pytest.approx(float(alone.score[0]))

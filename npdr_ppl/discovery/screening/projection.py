@@ -16,10 +16,10 @@ segments but not within one. So the variance of a score is estimated from the sc
 segments' sums (Liang & Zeger 1986), never from the number of terms.
 """
 
-import copy
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -85,13 +85,10 @@ class Projection:
         self._information = (by_z.mT @ self._weights).sum(0) + prior
         self._score = (by_z.mT @ self._weighted[..., None])[..., 0]  # (S, d)
 
-    def bare(self) -> "Projection":
-        """Returns a copy without cached results, which need not be sent to another process."""
-        other = copy.copy(self)
-        for name in ("num_measured", "_starts_by_size", "whitened_parameters", "misfit"):
-            other.__dict__.pop(name, None)
-        other.hypothesis = replace(self.hypothesis)
-        return other
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out cached results, which the other process computes again if it needs them."""
+        cached = {n for n, v in vars(type(self)).items() if isinstance(v, cached_property)}
+        return {name: value for name, value in vars(self).items() if name not in cached}
 
     @cached_property
     def num_measured(self) -> Tensor:

@@ -84,8 +84,8 @@ def sensitivities(
         hypothesis: The fitted model that the effects would be added to.
         effects: The candidates.
         hints: Additional shapes to try, by effect's name: values of its parameters.
-        projection: The fitted model's residuals, if sizes of a resonance that cannot explain them
-            are of no use.
+        projection: The fitted model, to leave out sizes of a resonance that cannot explain its
+            residuals; ``None`` to leave out only sizes that change the motion alike.
     """
     fit, own = hypothesis.fit, hypothesis.segments
     segments = own.in_coarser_steps(fit.z, fit.offsets)
@@ -126,12 +126,13 @@ def _at_telling_sizes(
     changed: "Callable[[list[_Probe]], list[Tensor]]",
     projection: Projection | None,
 ) -> "tuple[list[_Probe], list[Tensor]]":
-    """Returns the probes with as many of their sizes as differ, and their changes.
+    """Returns the probes with the sizes that tell something, and their changes.
 
     Far from the frequencies of the motion, neighbouring resonances change it alike. Between two
-    sizes that do not, the one in the middle is tried, and so on. Nothing is tried between two that
-    no recording tells apart, and between two whose changes are too large to explain the residuals,
-    as those of a joint so soft that its servo is unstable.
+    sizes that do not, the one in the middle is tried, and so on. With residuals, changes are
+    compared by what initial states and parameters leave of them. Nothing is then tried between two
+    sizes whose changes are too large to explain the residuals, for example if a soft joint makes
+    its servo unstable. It is assumed that those between them are too large as well.
 
     Args:
         group: Probes of resonances with all their sizes, which ascend.
@@ -140,20 +141,14 @@ def _at_telling_sizes(
     """
     num = len(group[0].cases)
     found: list[dict[int, Tensor]] = [{} for _ in group]
-    left: list[dict[int, Tensor]] = [{} for _ in group]
     waiting = [sorted({*range(0, num, SENSITIVITY.resonance_stride), num - 1}) for _ in group]
     while any(waiting):
         asked = [probe.at(cases) for probe, cases in zip(group, waiting, strict=True) if cases]
         rows = iter(changed(asked))
         for k, (probe, cases) in enumerate(zip(group, waiting, strict=True)):
             if cases:
-                parts = next(rows).split(len(probe.strengths))
-                found[k] |= dict(zip(cases, parts, strict=True))
-                left[k] |= {
-                    c: _left(part, projection) for c, part in zip(cases, parts, strict=True)
-                }
-        largest = math.inf if projection is None else _largest(projection)
-        waiting = [_between_unlike(each, largest) for each in left]
+                found[k] |= dict(zip(cases, next(rows).split(len(probe.strengths)), strict=True))
+                waiting[k] = _between_unlike(found[k], projection)
     chosen = [sorted(known) for known in found]
     return (
         [probe.at(cases) for probe, cases in zip(group, chosen, strict=True)],
@@ -161,38 +156,35 @@ def _at_telling_sizes(
     )
 
 
-def _left(change: Tensor, projection: Projection | None) -> Tensor:
-    """Returns what initial states and parameters leave of a change ``(k, S, N)``, flat."""
-    if projection is not None:
-        change = projection.projected(change.permute(1, 2, 0))
-    return change.flatten()
-
-
-def _largest(projection: Projection) -> float:
-    """Returns the size of a change above which every multiple that stands for it fits worse.
-
-    The misfit |r − m x|² of a change x exceeds |r|² for all m above 2 |r| / |x|, whatever its
-    direction.
-    """
-    return 2.0 * SENSITIVITY.resonance_ratio * math.sqrt(projection.misfit)
-
-
-def _between_unlike(known: Mapping[int, Tensor], largest: float) -> list[int]:
+def _between_unlike(known: Mapping[int, Tensor], projection: Projection | None) -> list[int]:
     """Returns the middles between neighbouring sizes that differ, unless both are too large.
 
     Args:
-        known: Changes of the whitened measurements by sizes.
-        largest: Size of a change that is too large to explain anything.
+        known: Changes of the whitened measurements by sizes, ``(k, S, N)``.
+        projection: As for :func:`_at_telling_sizes`.
     """
+    cases = sorted(known)
+    columns = torch.stack([known[case].sum(0) for case in cases], dim=-1)
+    if projection is None:
+        flat = columns.flatten(0, 1)
+        products, scores, misfit = flat.mT @ flat, torch.zeros(len(cases)), math.inf
+    else:
+        found = projection.scores(columns)
+        products, scores, misfit = found.information, found.score, projection.misfit
     middles = []
-    for one, other in itertools.pairwise(sorted(known)):
-        a, b = known[one], known[other]
-        sizes = a.norm(), b.norm()
-        likeness = (a @ b) / (sizes[0] * sizes[1]).clamp_min(1e-300)
-        # Changes that are less than one standard deviation apart are not told apart.
-        is_alike = float(likeness) >= SENSITIVITY.alike or float((a - b).norm()) < 1.0
-        is_useful = float(torch.stack(sizes).nan_to_num(math.inf).min()) < largest
-        if other - one > 1 and is_useful and not is_alike:
+    for k, (one, other) in enumerate(itertools.pairwise(cases)):
+        if other - one == 1:
+            continue
+        (a, ab), (_, b) = products[k : k + 2, k : k + 2].tolist()
+        is_alike = ab >= SENSITIVITY.alike * math.sqrt(max(a * b, 1e-300))
+        # Neither noise nor the residuals tell these apart.
+        score = float(scores[k + 1] - scores[k])
+        is_alike |= max(a + b - 2.0 * ab, abs(score)) < SENSITIVITY.least_difference
+        # |r - m x|² exceeds |r|² for all m above 2 |r| / |x|. Without those between them, the
+        # larger size stands for these, too, with smaller multiples m.
+        least = SENSITIVITY.resonance_ratio ** (one - other)
+        is_useless = not (a <= 4.0 * misfit or least**2 * b <= 4.0 * misfit)
+        if not (is_alike or is_useless):
             middles.append((one + other) // 2)
     return middles
 

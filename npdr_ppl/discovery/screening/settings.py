@@ -255,6 +255,8 @@ class SensitivitySettings:
         resonance_stride: Every how many of them is tried first.
         alike: Cosine of the changes by two sizes from which those between them are not tried. The
             linear gain of a size between them is then known to 3 %.
+        least_difference: Squared distance of two changes, and difference of their scores, below
+            which nothing between them is tried: less than what noise alone changes.
         first_limit: First value tried for a limit of commands, as a fraction of the largest
             command.
         limit_quantiles: Quantiles of its prior at which a limit is tried if the recorded commands
@@ -276,6 +278,7 @@ class SensitivitySettings:
     resonant_sizes: tuple[float, ...] = tuple(0.05 * 1.1**k for k in range(40))
     resonance_stride: int = 4
     alike: float = 0.95
+    least_difference: float = 1.0
     first_limit: float = 0.7
     limit_quantiles: tuple[float, ...] = (0.95, 0.75, 0.5, 0.25, 0.05)
     rounding_errors: float = 100.0
@@ -300,6 +303,7 @@ class SensitivitySettings:
         check_range(self, 0.0, 1.0, "shape_quantiles", "limit_quantiles")
         check_range(self, 1, math.inf, "most_shapes", "segments_per_part", "resonance_stride")
         check_range(self, 0.0, 1.0, "alike")
+        check_range(self, 0.0, 100.0, "least_difference")
 
 
 ALARM = AlarmSettings()

@@ -131,18 +131,17 @@ def _in_all_shapes(
     # Every part holds effects of every kind.
     num_parts = min(len(candidates), PARTS_PER_PROCESS * number)
     parts = [candidates[k::num_parts] for k in range(num_parts)]
-    bare = projection.bare()
-    # A resonance needs the residuals; they are large.
-    sent = bare if any(effect.is_resonant for effect in candidates) else None
-    listed = partial(_listed, bare.hypothesis, hints=hints, projection=sent)
-    for part in side_by_side(listed, parts, number):
-        yield from part
+    bare = replace(hypothesis)  # without cached results, which need not be sent
+    # The derivatives are large, so they are sent only with resonances, which need them.
+    items = [(part, projection if any(e.is_resonant for e in part) else None) for part in parts]
+    for found in side_by_side(partial(_listed, bare, hints), items, number):
+        yield from found
 
 
 def _listed(
     hypothesis: Hypothesis,
-    effects: tuple[Effect, ...],
     hints: Mapping[str, Mapping[str, float]],
-    projection: Projection | None,
+    item: tuple[tuple[Effect, ...], Projection | None],
 ) -> list[Variant]:
+    effects, projection = item
     return list(sensitivities(hypothesis, effects, hints, projection))

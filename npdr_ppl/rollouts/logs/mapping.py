@@ -151,7 +151,7 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                     "the mapping has no channels; each needs a table such as [channels.angle] "
                     "with the key signal."
                 )
-            episodes = self.log.episodes or log.episodes
+            episodes = log.episodes if self.log.episodes is None else self.log.episodes
             recording = rollouts_of(
                 [_converted(log, *entry) for entry in self.channels.items()],
                 [_converted(log, *entry) for entry in self.actions.items()],

@@ -514,3 +514,7 @@ def test_tables_of_a_folder_begin_anew_together(tmp_path):
     pd.DataFrame(both).to_csv(folder / "hand.csv", index=False)
     log = read_log(folder).by_name
     assert np.array_equal(log["arm/angle"].time, log["hand/angle"].time)
+    channels = {name: {"signal": f"{name}/angle"} for name in ("arm", "hand")}
+    rollouts = Rollouts.load(folder, {"log": {"episodes": "arm/run"}, "channels": channels})
+    assert len(rollouts) == 2
+    assert all(bool((part.readings[0][:, 0] == part.readings[0][:, 1]).all()) for part in rollouts)

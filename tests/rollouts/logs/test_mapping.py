@@ -276,17 +276,49 @@ def test_episodes_become_rollouts_though_their_time_begins_anew():
     assert len(Rollouts.from_dataframe(frame.rename(columns={"lap": "episode"}), chosen)) == 2
 
 
+def laps(**columns):
+    """A table in which the time begins anew at row 9."""
+    lap = [3] * 9 + [4] * 9
+    return pd.DataFrame({"lap": lap, "t": [*TIME, *TIME], "a": np.arange(18.0)} | columns)
+
+
+def num_rollouts(frame, **log):
+    return len(Rollouts.from_dataframe(frame, mapping_of("a", **log)))
+
+
 def test_a_column_that_counts_up_as_the_time_begins_anew_marks_rollouts():
-    frame = pd.DataFrame({"lap": [3] * 9 + [4] * 9, "t": [*TIME, *TIME], "a": np.arange(18.0)})
-    rollouts = Rollouts.from_dataframe(frame, mapping_of("a"))
+    rollouts = Rollouts.from_dataframe(laps(), mapping_of("a"))
     assert len(rollouts) == 2
-    assert "the time begins anew with each 'lap'; each is a rollout." in rollouts.notes
-    # A column that changes elsewhere, too, or by half a step, is something else.
-    for other in ([3] * 8 + [4] * 10, [3] * 5 + [4] * 4 + [5] * 9, [3] * 9 + [3.5] * 9):
-        assert len(Rollouts.from_dataframe(frame.assign(lap=other), mapping_of("a"))) == 1
-    # Nothing begins anew.
-    later = [*TIME, *(TIME + TIME[-1] + 1.0)]
-    assert len(Rollouts.from_dataframe(frame.assign(t=later), mapping_of("a"))) == 1
+    assert any("the time begins anew with each 'lap'" in note for note in rollouts.notes)
+    assert num_rollouts(laps(), episodes="") == 1
+    # A cell, or the first time stamp of a lap, may be missing.
+    assert num_rollouts(laps(lap=[3] * 4 + [np.nan] + [3] * 4 + [4] * 9)) == 2
+    assert num_rollouts(laps(t=[*TIME, np.nan, *TIME[1:]])) == 2
+    # Two samples that changed places do not begin anew.
+    swapped = [*TIME[:3], TIME[4], TIME[3], *TIME[5:]]
+    assert num_rollouts(laps(t=[*TIME, *swapped])) == 2
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"lap": [3] * 8 + [4] * 10},
+        {"lap": [3] * 5 + [4] * 4 + [5] * 9},
+        {"lap": [3] * 9 + [3.5] * 9},
+        {"lap": [4] * 9 + [3] * 9},
+        {"t": [*TIME, *(TIME + TIME[-1] + 1.0)]},
+        {"lap": np.arange(18), "t": np.arange(18)[::-1]},
+    ],
+    ids=["elsewhere", "twice", "half", "down", "later", "descending"],
+)
+def test_other_columns_do_not_mark_rollouts(columns):
+    assert num_rollouts(laps(**columns)) == 1
+
+
+def test_a_command_for_each_rollout_is_no_counter(tmp_path):
+    frame = laps().rename(columns={"lap": "voltage", "a": "position"}).assign(trial=laps().lap)
+    frame.to_csv(tmp_path / "steps.csv", index=False)
+    assert read_log(tmp_path / "steps.csv").episodes == "trial"
 
 
 def test_words_for_missing_values(tmp_path):
@@ -294,3 +326,12 @@ def test_words_for_missing_values(tmp_path):
     signals = read_log(tmp_path / "x.csv").by_name
     assert signals["a"].values.tolist() == [1.0, 4.0]
     assert signals["b"].values.tolist() == [2.0, 1.0]
+
+
+def test_stamps_of_messages_go_on_with_the_time_of_their_table(tmp_path):
+    frame = laps().rename(columns={"a": "imu/x"})
+    frame["imu/header/stamp"] = frame.t + 0.001
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    rollouts = Rollouts.load(tmp_path / "log.csv", mapping_of("imu/x"))
+    assert [part.readings[0][0, 0] for part in rollouts] == [0.0, 9.0]
+    assert [len(part.readings[0]) for part in rollouts] == [9, 9]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
+from npdr_ppl.rollouts.logs.formats.episodes import continued, episodes_in
 from npdr_ppl.rollouts.logs.formats.time_stamps import (
     MAX_CLOCK_DIFFERENCE,
     is_stamp,
@@ -31,9 +32,6 @@ Texts = list[str]
 
 Columns = Mapping[str, "Array | Texts"]
 """Columns by name: numbers ``(N,)`` or vectors ``(N, K)``, NaN where one is missing, or text."""
-
-EPISODE_NAMES = ("episode_index", "episode", "rollout")
-"""Columns whose every change begins a new episode, unless the mapping names another one."""
 
 _WORDS = {
     **dict.fromkeys(("", "nan", "na", "n/a", "null", "none", "-", "inf", "+inf", "-inf"), np.nan),
@@ -144,9 +142,12 @@ def log_of_columns(
     if skipped:
         told = rollout_checks.shown(", ".join(skipped), 200)
         notes.append(Remark(f"{about}text was left out: {told}."))
-    episodes = "" if prefix else _episodes(time, numbers, settings, notes)
+    shift, episodes = np.zeros(len(time)), ""
+    if not prefix:  # tables of a folder have one clock, which goes on for all of them later
+        episodes, remark = episodes_in(time, numbers, settings)
+        notes += [remark] if remark else []
     if episodes in numbers:
-        time = _continued(time, numbers[episodes])
+        shift = continued(time, numbers[episodes]) - time
     stamps: dict[str, Array] = {}
     if not settings.time:
         stamps, different = _stamps(numbers, time, settings, in_seconds)
@@ -158,13 +159,18 @@ def log_of_columns(
             for name, difference in different.items()
         ]
     signals = []
+    time = time + shift
     is_timed = np.isfinite(time)
     for name, values in numbers.items():
         if name in stamps:
             continue
         own = next((s for s in stamps if name.startswith(s[: -len("header/stamp")])), None)
         is_known = np.isfinite(values)
-        at = time if own is None else np.where(np.isfinite(stamps[own]), stamps[own], np.nan)
+        at = (
+            time
+            if own is None
+            else np.where(np.isfinite(stamps[own]), stamps[own], np.nan) + shift
+        )
         keep = is_known & (is_timed if own is None else np.isfinite(at))
         unit = (units or {}).get(name, "")
         signals.append(
@@ -255,65 +261,6 @@ def _stamps(
         else:
             different[name] = difference
     return found, different
-
-
-def _episodes(
-    time: Array, numbers: Mapping[str, Array], settings: LogSettings, notes: list[str]
-) -> str:
-    """Returns the column whose every change begins a new episode; ``""`` if there is none.
-
-    Args:
-        time: Time stamps in s, ``(N,)``.
-        numbers: The columns, ``(N,)`` each.
-        settings: They may name the column.
-        notes: A remark is added if only the time tells.
-    """
-    named = settings.episodes or next((n for n in EPISODE_NAMES if n in numbers), "")
-    if named:
-        return named
-    counter = _counter_of_restarts(time, numbers)
-    if counter:
-        told = rollout_checks.shown(counter)
-        notes.append(Remark(f"the time begins anew with each {told}; each is a rollout."))
-    return counter
-
-
-def _counter_of_restarts(time: Array, numbers: Mapping[str, Array]) -> str:
-    """Returns the column that counts up wherever the time goes back, and only there.
-
-    Args:
-        time: Time stamps in s, ``(N,)``.
-        numbers: The columns, ``(N,)`` each.
-
-    Returns:
-        Its name; ``""`` if there is none, or if the time never goes back.
-    """
-    restarts = np.diff(time) < 0
-    if not restarts.any():
-        return ""
-    for name, values in numbers.items():
-        steps = np.diff(values)
-        if np.array_equal(steps > 0, restarts) and np.array_equal(steps != 0, restarts):
-            if (values == np.round(values)).all():
-                return name
-    return ""
-
-
-def _continued(time: Array, episodes: Array) -> Array:
-    """Returns time stamps that go on from episode to episode, where each began anew.
-
-    Args:
-        time: Time stamps in s, ``(N,)``.
-        episodes: Number of the episode of each row, ``(N,)``.
-    """
-    begins = np.flatnonzero(np.diff(episodes) != 0) + 1
-    if not len(begins) or not (np.diff(time)[begins - 1] <= 0).any():
-        return time
-    steps = np.diff(time)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-    jumps = np.zeros(len(time))
-    jumps[begins] = np.where(steps[begins - 1] <= 0, usual - steps[begins - 1], 0.0)
-    return time + np.cumsum(jumps)
 
 
 def _components(

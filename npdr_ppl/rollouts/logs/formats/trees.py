@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.formats.tables import EPISODE_NAMES
+from npdr_ppl.rollouts.logs.formats.episodes import named_episodes
 from npdr_ppl.rollouts.logs.formats.time_stamps import is_time_name, seconds_of
 from npdr_ppl.rollouts.logs.log import Log, Signal
 from npdr_ppl.rollouts.logs.log_settings import HOW_TO_NAME_TIME, LogSettings
@@ -80,8 +80,8 @@ def log_of_tree(source: str, leaves: Mapping[str, Leaf], settings: LogSettings) 
     if skipped:
         told = rollout_checks.shown(", ".join(skipped), 200)
         notes.append(Remark(f"no time stamps fit the length of {told}; left out."))
-    names = [signal.name for signal in signals]
-    episodes = settings.episodes or next((n for n in EPISODE_NAMES if n in names), "")
+    names = {signal.name: signal for signal in signals}
+    episodes = named_episodes(names, settings)
     return Log(source, tuple(signals), tuple(notes), episodes if episodes in names else "")
 
 
