@@ -240,7 +240,7 @@ class Investigation:
             self._data_options,
             seed=self.seed,
             progress=self.progress,
-            is_approximate=self.search.is_approximate,
+            is_approximate=self.search.is_approximate or self.search.has_stopped,
         )
 
     @cached_property

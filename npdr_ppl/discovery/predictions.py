@@ -32,7 +32,8 @@ class Predictions:
         options: How the recording that was searched is prepared.
         seed: Seed of everything random.
         progress: Shows the stages, and records how long they take.
-        is_approximate: Whether the revised model leaves something unexplained.
+        is_approximate: Whether the revised model leaves something unexplained, or may do so
+            because the search was ended early.
     """
 
     def __init__(

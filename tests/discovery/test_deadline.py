@@ -5,6 +5,7 @@ import json
 import pytest
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.discovery.search.deadline import Deadline
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.shortlist import fit_shortlist
@@ -63,6 +64,23 @@ def test_a_search_keeps_what_it_found_in_time(dragged):
     assert found.has_stopped
     assert found.final.names == ("hinge.quadratic_drag",)
     assert len(found.added) == 1
+
+
+@pytest.mark.slow
+def test_draws_of_a_search_that_was_ended_early_are_rough(dragged, monkeypatch):
+    case, _ = dragged
+    asked = []
+
+    def drawn(hypothesis, *, seed, is_rough):
+        asked.append(is_rough)
+
+    monkeypatch.setattr("npdr_ppl.discovery.predictions.posterior_draws", drawn)
+    options = npdr.DiscoveryOptions(effects=EFFECTS, time_limit=1e-6)
+    investigation = Investigation(case.model, case.fit, search=options)
+    search = investigation.search
+    assert search.has_stopped and not search.is_approximate
+    investigation._predictions.draws(search.final)
+    assert asked == [True]
 
 
 def test_a_model_that_lacks_nothing_needs_no_further_time(quiet):
