@@ -54,7 +54,7 @@ class Predictions:
         self._options = options
         self._seed = seed
         self._progress = progress
-        # A model that lacks effects predicts; its intervals are wrong.
+        # A model that lacks, or may lack, effects predicts; its intervals may be wrong anyway.
         self._lacks_effects = [given] if given is not revised else []
         self._lacks_effects += [revised] if is_approximate else []
         self._drawn: list[tuple[Hypothesis, Draws]] = []

@@ -1,6 +1,9 @@
 """The shape of a law that is linear in other parameters."""
 
+from dataclasses import replace
+
 import pytest
+import torch
 from hidden_rigs import make_case
 
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
@@ -11,7 +14,7 @@ from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.screening.variants import variants_of
 from npdr_ppl.discovery.segment_options import segment_options
-from npdr_ppl.models.effects import Bias, QuadraticDrag, Spring
+from npdr_ppl.models.effects import Bias, Spring
 
 
 @pytest.fixture(scope="module")
@@ -34,17 +37,32 @@ def test_a_spring_is_tried_at_the_rest_position_that_explains_most(sprung):
     assert best.variant.values["rest"] == pytest.approx(truth, abs=0.1 * span)
 
 
-def test_only_laws_of_the_position_with_a_shape_have_one(sprung):
+class Ratchet(Spring):
+    """A spring that is stiffer in one direction."""
+
+    id = "ratchet"
+
+    def columns(self, position, velocity):
+        return tuple(
+            torch.where(velocity > 0.0, 2.0, 1.0) * c for c in super().columns(position, velocity)
+        )
+
+
+def test_only_laws_of_a_measured_position_have_a_shape(sprung):
     _, projection, found = sprung
+    assert set(linear_shape(projection, found, Spring("rail"))) == {"rest"}
     assert linear_shape(projection, found, Bias("rail")) == {}
-    assert linear_shape(projection, found, QuadraticDrag("rail")) == {}
+    assert linear_shape(projection, found, Ratchet("rail")) == {}
+    assert linear_shape(projection, replace(found, positions={}), Spring("rail")) == {}
 
 
 def test_a_spring_that_would_push_away_has_no_shape(sprung):
     _, projection, found = sprung
-    assert set(linear_shape(projection, found, Spring("rail"))) == {"rest"}
-    turned = Projection(projection.hypothesis)
-    turned.residual = -projection.residual
-    turned._weighted = -projection._weighted
-    turned._score = -projection._score
-    assert linear_shape(turned, found, Spring("rail")) == {}
+    turned = replace(found, by_port={port: -change for port, change in found.by_port.items()})
+    assert linear_shape(projection, turned, Spring("rail")) == {}
+
+
+def test_a_shape_that_the_recording_does_not_determine_is_not_tried(sprung):
+    _, projection, found = sprung
+    still = {name: torch.ones_like(value) for name, value in found.channels.items()}
+    assert linear_shape(projection, replace(found, channels=still), Spring("rail")) == {}

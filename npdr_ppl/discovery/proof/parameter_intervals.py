@@ -80,9 +80,9 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False
     Args:
         hypothesis: The fitted model.
         seed: Seed of the draws.
-        is_rough: Whether the model lacks effects, so that intervals are wrong anyway: then the
-            draws take at most ``INTERVALS.rough_iterations`` proposals, and ridges are taken as
-            straight.
+        is_rough: Whether rough intervals will do, because the model lacks effects or the time is
+            over: then the draws take at most ``INTERVALS.rough_iterations`` proposals, and ridges
+            are taken as straight.
 
     Raises:
         DataError: Simulations fail close to the fit.

@@ -81,8 +81,8 @@ class IntervalSettings:
             interval of draws that are not smoothed would be where they happen to be dense.
         bandwidth: Spread of these draws, in standard deviations of the posterior.
         mass: Probability of the interval of highest density.
-        rough_iterations: Greatest number of proposals for draws of a model that lacks effects.
-            Their weights need not be reliable, because the model is wrong.
+        rough_iterations: Greatest number of proposals for draws of a model that lacks effects,
+            whose weights need not be reliable because the model is wrong, or after a time limit.
     """
 
     copies: int = 16

@@ -17,7 +17,7 @@ segments' sums (Liang & Zeger 1986), never from the number of terms.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -88,7 +88,8 @@ class Projection:
     def __getstate__(self) -> dict[str, Any]:
         """Leaves out cached results, which the other process computes again if it needs them."""
         cached = {n for n, v in vars(type(self)).items() if isinstance(v, cached_property)}
-        return {name: value for name, value in vars(self).items() if name not in cached}
+        state = {name: value for name, value in vars(self).items() if name not in cached}
+        return state | {"hypothesis": replace(self.hypothesis)}
 
     @cached_property
     def num_measured(self) -> Tensor:

@@ -129,10 +129,10 @@ def _at_telling_sizes(
     """Returns the probes with the sizes that tell something, and their changes.
 
     Far from the frequencies of the motion, neighbouring resonances change it alike. Between two
-    sizes that do not, the one in the middle is tried, and so on. With residuals, changes are
-    compared by what initial states and parameters leave of them. Nothing is then tried between two
-    sizes whose changes are too large to explain the residuals, for example if a soft joint makes
-    its servo unstable. It is assumed that those between them are too large as well.
+    sizes that do not, the one in the middle is tried, and so on. With residuals, the part of the
+    changes that initial states and parameters can imitate is removed first. Nothing is tried
+    between two sizes whose changes are too large to explain the residuals, for example if a soft
+    joint makes its servo unstable. It is assumed that those between them are too large as well.
 
     Args:
         group: Probes of resonances with all their sizes, which ascend.
@@ -160,7 +160,8 @@ def _between_unlike(known: Mapping[int, Tensor], projection: Projection | None) 
     """Returns the middles between neighbouring sizes that differ, unless both are too large.
 
     Args:
-        known: Changes of the whitened measurements by sizes, ``(k, S, N)``.
+        known: Changes of the whitened measurements by sizes, ``(1, S, N)``: a resonance has one
+            strength.
         projection: As for :func:`_at_telling_sizes`.
     """
     cases = sorted(known)
@@ -180,8 +181,8 @@ def _between_unlike(known: Mapping[int, Tensor], projection: Projection | None) 
         # Neither noise nor the residuals tell these apart.
         score = float(scores[k + 1] - scores[k])
         is_alike |= max(a + b - 2.0 * ab, abs(score)) < SENSITIVITY.least_difference
-        # |r - m x|² exceeds |r|² for all m above 2 |r| / |x|. Without those between them, the
-        # larger size stands for these, too, with smaller multiples m.
+        # |r - m x|² exceeds |r|² for all m above 2 |r| / |x|. If no size between them is tried,
+        # the larger one stands for those as well, with multiples m down to this one.
         least = SENSITIVITY.resonance_ratio ** (one - other)
         is_useless = not (a <= 4.0 * misfit or least**2 * b <= 4.0 * misfit)
         if not (is_alike or is_useless):

@@ -256,7 +256,8 @@ class SensitivitySettings:
         alike: Cosine of the changes by two sizes from which those between them are not tried. The
             linear gain of a size between them is then known to 3 %.
         least_difference: Squared distance of two changes, and difference of their scores, below
-            which nothing between them is tried: less than what noise alone changes.
+            which nothing between them is tried. Noise of unit variance exceeds both if they are
+            below one.
         first_limit: First value tried for a limit of commands, as a fraction of the largest
             command.
         limit_quantiles: Quantiles of its prior at which a limit is tried if the recorded commands

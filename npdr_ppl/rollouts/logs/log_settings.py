@@ -41,7 +41,7 @@ class LogSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             the recorder's time stamps where messages have stamps of their own.
         time_unit: Unit of the time stamps.
         header: Whether the first line of a CSV file names the columns.
-        episodes: Signal whose every change begins a new rollout.
+        episodes: Signal whose every change begins a new rollout; ``""`` for one rollout.
         time_step: Seconds between the steps of the rollouts. In a table without time stamps, also
             the seconds between rows.
     """

@@ -289,7 +289,7 @@ def num_rollouts(frame, **log):
 def test_a_column_that_counts_up_as_the_time_begins_anew_marks_rollouts():
     rollouts = Rollouts.from_dataframe(laps(), mapping_of("a"))
     assert len(rollouts) == 2
-    assert any("the time begins anew with each 'lap'" in note for note in rollouts.notes)
+    assert any("the time begins anew whenever 'lap' increases" in note for note in rollouts.notes)
     assert num_rollouts(laps(), episodes="") == 1
     # A cell, or the first time stamp of a lap, may be missing.
     assert num_rollouts(laps(lap=[3] * 4 + [np.nan] + [3] * 4 + [4] * 9)) == 2

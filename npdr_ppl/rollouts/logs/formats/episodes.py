@@ -1,6 +1,6 @@
 """Finds the column of a table whose every change begins a new episode."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -11,17 +11,17 @@ from npdr_ppl.rollouts.logs.log_settings import LogSettings
 from npdr_ppl.rollouts.logs.signal_names import role_of
 from npdr_ppl.rollouts.notes import Remark
 
-__all__ = ["continued", "episodes_in", "named_episodes"]
+__all__ = ["episodes_in", "named_episodes", "shift_of_episodes"]
 
 EPISODE_NAMES = ("episode_index", "episode", "rollout")
 """Columns whose every change begins a new episode, unless the mapping names another one."""
 
 
-def named_episodes(names: Mapping[str, object], settings: LogSettings) -> str:
+def named_episodes(names: Collection[str], settings: LogSettings) -> str:
     """Returns the signal that the mapping names, or one with a usual name; ``""`` if none.
 
     Args:
-        names: The signals by name.
+        names: Names of the signals.
         settings: They may name the signal, or say with ``""`` that there is none.
     """
     if settings.episodes is not None:
@@ -34,7 +34,7 @@ def episodes_in(
 ) -> tuple[str, Remark | None]:
     """Returns the column that marks episodes, and a remark if only the time tells.
 
-    Without a named column, it is one that counts up wherever the clock was restarted, and only
+    Without a named column, it is one that increases wherever the clock was restarted, and only
     there. Its name must not tell that it is a command or a measurement, such as the height of a
     step that each episode applies.
 
@@ -47,45 +47,35 @@ def episodes_in(
         Its name, ``""`` if there is none, and the remark.
     """
     named = named_episodes(columns, settings)
-    if named or settings.episodes is not None:
+    num = len(restarts(time))
+    if named or settings.episodes is not None or not num:
         return named, None
-    if not len(restarts(time)):
-        return "", None
     for name, values in columns.items():
         known = np.isfinite(time) & np.isfinite(values)
         counts = values[known]
-        (ups,), (changes,) = (
-            np.nonzero(counts[1:] > counts[:-1]),
-            np.nonzero(counts[1:] != counts[:-1]),
-        )
-        begins = restarts(time[known])
-        is_counter = np.array_equal(ups, changes) and bool((counts == np.round(counts)).all())
-        if (
-            is_counter
-            and len(begins)
-            and np.array_equal(ups + 1, begins)
-            and role_of(name) == "other"
-        ):
+        if role_of(name) != "other" or not (counts == np.round(counts)).all():
+            continue
+        changes = np.flatnonzero(counts[1:] != counts[:-1]) + 1
+        is_rising = bool((counts[changes] > counts[changes - 1]).all())
+        if len(changes) == num and is_rising and np.array_equal(changes, restarts(time[known])):
             told = rollout_checks.shown(name)
             return name, Remark(
-                f"the time begins anew with each {told}, so each is a rollout; if not, set "
-                'episodes = "" below [log] in the mapping.'
+                f"the time begins anew whenever {told} increases, so each value of it is a "
+                'rollout; for one rollout, set episodes = "" below [log] in the mapping.'
             )
     return "", None
 
 
-def continued(time: Array, episodes: Array) -> Array:
-    """Returns time stamps that go on from episode to episode, where each began anew.
+def shift_of_episodes(time: Array, episodes: Array) -> Array:
+    """Returns what to add to time stamps so that they go on where an episode began anew, ``(N,)``.
 
     Args:
         time: Time stamps in s, ``(N,)``.
         episodes: Number of the episode of each row, ``(N,)``.
     """
     begins = np.flatnonzero(np.diff(episodes) != 0) + 1
-    if not len(begins) or not (np.diff(time)[begins - 1] <= 0).any():
-        return time
-    steps = np.diff(time)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-    jumps = np.zeros(len(time))
-    jumps[begins] = np.where(steps[begins - 1] <= 0, usual - steps[begins - 1], 0.0)
-    return time + np.cumsum(jumps)
+    jumps, steps = np.zeros(len(time)), np.diff(time)
+    if len(begins) and (steps[begins - 1] <= 0).any():
+        usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+        jumps[begins] = np.where(steps[begins - 1] <= 0, usual - steps[begins - 1], 0.0)
+    return np.cumsum(jumps)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from npdr_ppl.errors import DataError
 from npdr_ppl.reading_limits import LIMITS
 from npdr_ppl.rollouts import rollout_checks
-from npdr_ppl.rollouts.logs.formats.episodes import continued, episodes_in
+from npdr_ppl.rollouts.logs.formats.episodes import episodes_in, shift_of_episodes
 from npdr_ppl.rollouts.logs.formats.time_stamps import (
     MAX_CLOCK_DIFFERENCE,
     is_stamp,
@@ -147,7 +147,7 @@ def log_of_columns(
         episodes, remark = episodes_in(time, numbers, settings)
         notes += [remark] if remark else []
     if episodes in numbers:
-        shift = continued(time, numbers[episodes]) - time
+        shift = shift_of_episodes(time, numbers[episodes])
     stamps: dict[str, Array] = {}
     if not settings.time:
         stamps, different = _stamps(numbers, time, settings, in_seconds)

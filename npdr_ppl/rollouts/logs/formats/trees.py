@@ -80,7 +80,7 @@ def log_of_tree(source: str, leaves: Mapping[str, Leaf], settings: LogSettings) 
     if skipped:
         told = rollout_checks.shown(", ".join(skipped), 200)
         notes.append(Remark(f"no time stamps fit the length of {told}; left out."))
-    names = {signal.name: signal for signal in signals}
+    names = [signal.name for signal in signals]
     episodes = named_episodes(names, settings)
     return Log(source, tuple(signals), tuple(notes), episodes if episodes in names else "")
 
