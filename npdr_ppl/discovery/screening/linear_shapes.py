@@ -15,7 +15,7 @@ from npdr_ppl.language.reference import quantile
 __all__ = ["linear_shape"]
 
 _LEAST_LEFT = 1e-6
-"""Share of a column that others and refitted parameters must leave; rounding errors are smaller."""
+"""Share of a column that others and refitted parameters must leave, above rounding errors."""
 
 _TAIL = 0.001
 """Probability of the prior on each side outside which a shape is not tried: a fit that began there
