@@ -45,6 +45,11 @@ FRICTION_RANGE = (0.0, 10.0)
 """Prior of joint damping and friction loss as factors on the file's values. Both are rarely
 measured. Dry friction of four joints of the SO-101 is 2 to 8 times that of its file."""
 
+SOFTNESS_RANGE = (0.0001, 0.1)
+"""95 % of the prior of the softness of dry friction, from the hardest that MuJoCo allows to its
+default. With the default, a stuck joint creeps: one of 0.03 kg m² that holds 0.15 N m moves 5 mrad
+in a second. Real joints hold."""
+
 ROTOR_RANGE = (0.0, 10.0)
 """Prior of an armature of a URDF file, which cannot state any, as factors on a typical value: the
 inertia about the joint, or effort / ``ROTOR_ACCELERATION`` if that is larger, as in a wrist. Where
@@ -95,7 +100,7 @@ class DerivedParameter:
         nominal: Its value in the file.
         low: Smallest value of a uniform prior, or the 2.5 % quantile of a log-normal one.
         high: Largest value of a uniform prior, or the 97.5 % quantile of a log-normal one.
-        family: Family of the prior. The median of a log-normal one is the file's value.
+        family: Family of the prior.
     """
 
     name: str
@@ -110,7 +115,9 @@ class DerivedParameter:
     def prior(self) -> str:
         """The prior as Python."""
         if self.family == "log-normal":
-            return f"dist.LogNormal(math.log({self.nominal:.4g}), {GAIN_SPREAD:g})"
+            median = math.sqrt(self.low * self.high)
+            spread = 0.5 * math.log(self.high / self.low) / _QUANTILE
+            return f"dist.LogNormal(math.log({median:.4g}), {spread:.4g})"
         return f"dist.Uniform({self.low:.4g}, {self.high:.4g})"
 
 
@@ -166,10 +173,12 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
     """Chooses the uncertain numbers of an MJCF file, or of a URDF file that MuJoCo compiles.
 
     These are the masses of the bodies that joints move, with their inertias; damping, armature and
-    friction loss of joints, where the file has positive values; and kp and kv of position and
-    velocity servos. Of a URDF file, which cannot state armatures, those of all joints are varied,
-    too. Priors of gains are log-normal about the file's values, the others uniform, around the
-    file's values or from zero. What positions do not determine beside the others keeps the file's
+    friction loss of joints, where the file has positive values; how far friction loss yields, one
+    number for all joints, if the file leaves it at the engine's default; and kp and kv of position
+    and velocity servos. Of a URDF file, which cannot state armatures, those of all joints are
+    varied, too. Priors of gains are log-normal about the file's values, that of the softness of
+    friction is log-normal, too, and the others are uniform, around the file's values or from zero.
+    What positions do not determine beside the others keeps the file's
     value; see
     :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
 
@@ -214,6 +223,7 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
             found.append(
                 DerivedParameter(own, text, field.unit, in_file, low * value, high * value, family)
             )
+    found += _softness(model, {parameter.field for parameter in found})
     if not found:
         raise ModelError(f"{title} has no masses, friction or gains that its motion depends on.")
     return DerivedModel(title, tuple(found), held)
@@ -223,7 +233,10 @@ _Choice = tuple[str, str, str, tuple[float, float] | None]
 """Kind and name of an element, a quantity of it, and ends of its uniform prior as factors on the
 file's value; ``None`` for a log-normal prior about it."""
 
-_FACTOR = math.exp(1.96 * GAIN_SPREAD)
+_QUANTILE = 1.96
+"""The 97.5 % quantile of a standard normal distribution."""
+
+_FACTOR = math.exp(_QUANTILE * GAIN_SPREAD)
 """The factor that 95 % of a log-normal prior are within."""
 
 
@@ -263,6 +276,25 @@ def _joints(model: Any, armature: tuple[float, float]) -> list[_Choice]:
     }
     names = element_names(model, "joint")
     return [("joint", name, word, ends) for word, ends in ranges.items() for name in names]
+
+
+def _softness(model: Any, varied: set[str]) -> list[DerivedParameter]:
+    """Returns how far dry friction yields, if some is varied and the file keeps the default."""
+    field = find_field(model, "joint * friction_softness")
+    is_default = {entry.nominal for entry in field.entries} == {_DEFAULT_IMPEDANCE}
+    if not is_default or not any(text.endswith(" frictionloss") for text in varied):
+        return []
+    low, high = SOFTNESS_RANGE
+    nominal = 1.0 - _DEFAULT_IMPEDANCE
+    return [
+        DerivedParameter(
+            "friction_softness", field.text, field.unit, nominal, low, high, "log-normal"
+        )
+    ]
+
+
+_DEFAULT_IMPEDANCE = 0.9
+"""First number of ``solimpfriction`` if a file does not set it."""
 
 
 def _servos(model: Any) -> list[_Choice]:

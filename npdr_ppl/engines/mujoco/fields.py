@@ -33,14 +33,20 @@ class Entry(NamedTuple):
     Attributes:
         array: The array of the ``MjModel`` that contains it, ``"opt.…"`` for options.
         place: Its index in the flat array.
-        factor: Ratio of its value to the value of the field.
+        factor: Change of its value per change of the field's value.
         nominal: Its value in the file.
+        offset: Its value where the field is zero.
     """
 
     array: str
     place: int
     factor: float
     nominal: float
+    offset: float = 0.0
+
+    def number(self, value: Any) -> Any:
+        """Returns the number that a value of the field stands for."""
+        return self.offset + value * self.factor
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class Field:
     @property
     def nominal(self) -> float | None:
         """Value of the field in the file; ``None`` if its entries have different values."""
-        values = [entry.nominal / entry.factor for entry in self.entries if entry.factor]
+        values = [(e.nominal - e.offset) / e.factor for e in self.entries if e.factor]
         spread = max(values) - min(values)
         return values[0] if spread <= 1e-9 * max(map(abs, values)) else None
 
@@ -93,6 +99,8 @@ _QUANTITIES: dict[str, dict[str, _Quantity]] = {
     "joint": {
         "damping": _Quantity("dof_damping", "{force} s/{position}"),
         "frictionloss": _Quantity("dof_frictionloss", "{force}"),
+        # One minus the impedance; see :func:`_softness_entries`.
+        "friction_softness": _Quantity("dof_solimp", "1"),
         "armature": _Quantity("dof_armature", "{inertia}"),
         "stiffness": _Quantity("jnt_stiffness", "{force}/{position}"),
         "rest": _Quantity("qpos_spring", "{position}"),
@@ -211,7 +219,12 @@ def find_field(model: Any, text: str) -> Field:
     units = {_UNKNOWN.get(unit, unit) for unit in units}
     if len(units) > 1:
         raise ModelError(f"{text!r} mixes the units {', '.join(sorted(units))}.")
-    read = {"kp": _servo_entries, "kv": _servo_entries, "mass_and_inertia": _solid_entries}
+    read = {
+        "kp": _servo_entries,
+        "kv": _servo_entries,
+        "mass_and_inertia": _solid_entries,
+        "friction_softness": _softness_entries,
+    }
     if quantity in read:
         entries = [e for i in chosen for e in read[quantity](model, i, quantity, text)]
     else:
@@ -281,6 +294,21 @@ def _solid_entries(model: Any, body: int, quantity: str, text: str) -> list[Entr
         raise ModelError(f"{text!r}: the body has no mass, so its inertia has no ratio to it.")
     inertias = _entries(model, "body", body, info["inertia"], "")
     return [mass, *(e._replace(factor=e.nominal / mass.nominal) for e in inertias)]
+
+
+def _softness_entries(model: Any, joint: int, quantity: str, text: str) -> list[Entry]:
+    """Returns the numbers that set how far a joint's dry friction yields.
+
+    The engine's friction holds a joint only nearly: under a force f below the friction loss, the
+    joint creeps at about T f (1 − d) / (2 d m), where d is the first number of ``solimpfriction``,
+    T that of ``solreffriction`` and m the joint's inertia. The softness is 1 − d. The engine
+    allows 0.0001 to 0.9999.
+    """
+    info = _QUANTITIES["joint"][quantity]
+    return [
+        entry._replace(factor=-1.0, offset=1.0)
+        for entry in _entries(model, "joint", joint, info, "")
+    ]
 
 
 def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:

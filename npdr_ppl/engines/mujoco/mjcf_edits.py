@@ -38,6 +38,7 @@ class Edits:
         self.model = model
         self._degrees = self._angles_are_degrees()
         self._options: dict[str, tuple[str, str]] = {}  # of a file that has no such element
+        self._done: set[tuple[Callable[[Edits, int], None], int]] = set()
 
     def write(self, array: str, places: Sequence[int]) -> None:
         """Writes the numbers of an array at some places.
@@ -54,8 +55,11 @@ class Edits:
         width = int(np.prod(array_of(self.model, array).shape[1:]))
         if array not in _WRITERS:
             raise ModelError(f"{array} cannot be written into an MJCF file.")
+        writer = _WRITERS[array]
         for row in sorted({place // width for place in places}):
-            _WRITERS[array](self, row)
+            if (writer, row) not in self._done:  # several arrays may have the same writer
+                writer(self, row)
+                self._done.add((writer, row))
 
     def keep_damping(self) -> None:
         """Writes the kv of servos for which the file gives a damping ratio, which would set it."""
@@ -213,7 +217,7 @@ def _of_dof(name: str) -> Callable[[Edits, int], None]:
         higher = getattr(edits.model, f"dof_{name}poly", None)
         values = {name: _with_higher(*both(name), higher, dof)}
         if name == "frictionloss":
-            # As hard as in the package's simulations, where the friction is an effect.
+            # As hard as in the package's simulations.
             values |= {"solreffriction": both("solref"), "solimpfriction": both("solimp")}
         edits.attribute("joint", int(edits.model.dof_jntid[dof]), values)
 
@@ -264,9 +268,12 @@ def _limits(array: str, name: str) -> Callable[[Edits, int], None]:
     return write
 
 
+_dry_friction = _of_dof("frictionloss")
+
 _WRITERS: dict[str, Callable[[Edits, int], None]] = {
     "dof_damping": _of_dof("damping"),
-    "dof_frictionloss": _of_dof("frictionloss"),
+    "dof_frictionloss": _dry_friction,
+    "dof_solimp": _dry_friction,
     "dof_armature": _of_dof("armature"),
     "jnt_stiffness": _stiffness,
     "jnt_pos": _of("joint", "jnt_pos", "pos"),

@@ -11,7 +11,7 @@ and actuators, which are not part of Y.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from torch import Tensor
 
 from npdr_ppl.engines.mujoco.base_parameters import MujocoInverseDynamics, actuator_forces
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.language.channels import Parameter
 from npdr_ppl.language.linear_dynamics import BaseParameter, InverseDynamics, Motion
 
 if TYPE_CHECKING:
@@ -41,6 +42,9 @@ _LINEAR_ARRAYS = {
     "body_ipos",
 }
 
+_SOFTNESS = "dof_solimp"
+"""How far dry friction yields, which the equations of motion do not contain: in them it holds."""
+
 
 def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None:
     """Returns the linear form, or ``None`` if a simulator does not have it.
@@ -55,15 +59,18 @@ def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None
         (is_velocity, i) for is_velocity in (False, True) for i in range(model.nv)
     ]
     arrays = bindings.arrays
-    if not (is_simple and is_whole and arrays and arrays <= _LINEAR_ARRAYS):
+    if not (is_simple and is_whole and arrays and arrays <= _LINEAR_ARRAYS | {_SOFTNESS}):
         return None
     if not np.any(model.body_mass):
         return None
-    names = [parameter.name for parameter in simulator.parameters]
-    nominal = np.array([parameter.nominal for parameter in simulator.parameters])
+    held = bindings.names_setting({_SOFTNESS})
+    determined = tuple(p for p in simulator.parameters if p.name not in held)
+    nominal = np.array([parameter.nominal for parameter in determined])
+    rest = {p.name: torch.tensor(p.nominal, dtype=torch.float64) for p in simulator.parameters}
 
     def inertial(values: Array) -> Array:
-        given = dict(zip(names, torch.from_numpy(values).unbind(), strict=True))
+        names = [parameter.name for parameter in determined]
+        given = rest | dict(zip(names, torch.from_numpy(values).unbind(), strict=True))
         changed = _written(model, bindings.assignments(given, given))
         return MujocoInverseDynamics(changed).nominal()
 
@@ -76,7 +83,7 @@ def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None
     # Relative errors are 1e-16 for affine functions (rounding) and 1/4 for products of parameters.
     if np.any(error > 1e-9 * (np.abs(together) + np.abs(start) + np.abs(slopes) @ steps)):
         return None
-    return BoundInverseDynamics(simulator, start - slopes @ nominal, slopes)
+    return BoundInverseDynamics(simulator, determined, start - slopes @ nominal, slopes)
 
 
 class BoundInverseDynamics(InverseDynamics):
@@ -84,17 +91,22 @@ class BoundInverseDynamics(InverseDynamics):
 
     Args:
         simulator: The simulator.
+        determined: The parameters θ, all that the equations contain, ``k`` of them.
         constant: π_c, ``(P,)``.
         slopes: D, ``(P, k)``.
     """
 
-    def __init__(self, simulator: MujocoMechanism, constant: Array, slopes: Array) -> None:
+    def __init__(
+        self,
+        simulator: MujocoMechanism,
+        determined: Sequence[Parameter],
+        constant: Array,
+        slopes: Array,
+    ) -> None:
         self._model = simulator.model
         self._constant, self._slopes = constant, slopes
-        self.base = tuple(
-            BaseParameter(p.name, p.unit, p.description) for p in simulator.parameters
-        )
-        self.determined = tuple(parameter.name for parameter in simulator.parameters)
+        self.base = tuple(BaseParameter(p.name, p.unit, p.description) for p in determined)
+        self.determined = tuple(parameter.name for parameter in determined)
         masses = simulator.bindings.names_setting({"body_mass", "body_inertia"})
         brakes = {"dof_damping", "dof_frictionloss", "dof_armature"}
         self.positive = tuple(name for name in self.determined if name in masses)

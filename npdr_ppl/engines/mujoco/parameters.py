@@ -141,11 +141,12 @@ class Bindings:
                 for entry in field.entries:
                     # The nominal value gives exactly the file's number, without rounding errors.
                     result[entry.array, entry.place] = torch.where(
-                        value == nominal[name], entry.nominal, value * entry.factor
+                        value == nominal[name], entry.nominal, entry.number(value)
                     )
             for field in self._scaled.get(name, ()):
                 for entry in field.entries:
-                    result[entry.array, entry.place] = value * entry.nominal
+                    own = entry.nominal - entry.offset
+                    result[entry.array, entry.place] = entry.offset + value * own
         sizes = {value.numel() for value in parameters.values()} | {1}
         for field, rule in self._derived.items():
             try:
@@ -161,7 +162,7 @@ class Bindings:
                     f"got {value.shape=}."
                 )
             for entry in field.entries:
-                result[entry.array, entry.place] = value * entry.factor
+                result[entry.array, entry.place] = entry.number(value)
         return result
 
     def _check_targets(self) -> None:
