@@ -133,7 +133,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         *_table(rows),
     ]
     if any(p["family"] == "log-normal" for p in parameters):
-        lines += ["  * log-normal about the file's value; the range has 95 % of it"]
+        lines += ["  * log-normal; the range has 95 % of it"]
     if found["not varied"]:
         lines += ["", "Not varied, because positions do not determine them:"]
         lines += [f"  {field}: {reason}" for field, reason in found["not varied"].items()]

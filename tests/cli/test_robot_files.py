@@ -106,7 +106,7 @@ def test_inspect_prints_and_writes_the_model(folder, tmp_path, monkeypatch, caps
         "actuator servo kp",
         "may be left out",
         "time step 0.004 s",
-        "* log-normal about the file's value",
+        "* log-normal; the range has 95 % of it",
         "payload",
         "closest fit",
     ):

@@ -97,6 +97,7 @@ def test_moving_masses_positive_friction_and_gains_are_varied(arm):
         "shoulder_servo_kp": ("actuator shoulder_servo kp", "N m/rad", 40.0, *gains(40.0)),
         "shoulder_servo_kv": ("actuator shoulder_servo kv", "N m s/rad", 2.0, *gains(2.0)),
         "elbow_command_kv": ("actuator elbow_command kv", "N m s/rad", 0.5, *gains(0.5)),
+        "friction_softness": ("joint * friction_softness", "1", 0.1, 0.0001, 0.1),
     }
     # The stand does not move, the tip weighs nothing, and damping acts as kv does.
     assert list(found) == list(expected)
@@ -133,6 +134,7 @@ def test_the_python_simulates_as_an_edited_file_does(arm):
         compiled.body(body).mass[:] *= factor
         compiled.body(body).inertia[:] *= factor
     compiled.joint("elbow").frictionloss[:] = float(values["elbow_frictionloss"])
+    compiled.dof_solimp[:, 0] = 1.0 - float(values["friction_softness"])
     compiled.joint("shoulder").armature[:] = float(values["shoulder_armature"])
     kp, kv = float(values["shoulder_servo_kp"]), float(values["shoulder_servo_kv"])
     compiled.actuator_gainprm[0, 0] = kp
@@ -248,8 +250,18 @@ def test_small_friction_beside_a_stiff_servo_has_an_effect(tmp_path):
     )
     derived = derive_model(path)
     names = [p.name for p in derived.parameters]
-    assert names == ["j_frictionloss", "j_command_kp", "j_command_kv"]
+    assert names == ["j_frictionloss", "j_command_kp", "j_command_kv", "friction_softness"]
     assert list(derived.held) == ["body link mass_and_inertia"]
+
+
+def test_friction_whose_hardness_the_file_sets_keeps_it(arm):
+    softened = 'frictionloss="0.05" solimpfriction="0.99 0.99"'
+    arm.write_text(ARM.replace('frictionloss="0.05"', softened))
+    derived = derive_model(arm)
+    names = [p.name for p in derived.parameters]
+    assert "elbow_frictionloss" in names and "friction_softness" not in names
+    arm.write_text(ARM.replace('frictionloss="0.05"', ""))
+    assert "friction_softness" not in [p.name for p in derive_model(arm).parameters]
 
 
 def test_gains_of_a_tendons_servo_have_no_unit_of_force(tmp_path):

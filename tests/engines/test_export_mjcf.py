@@ -134,6 +134,7 @@ ADDRESSES = {
     "centre": ("body hand centre z", -0.15),
     "damping": ("joint shoulder damping", 0.5),
     "friction": ("joint elbow frictionloss", 0.1),
+    "softness": ("joint elbow friction_softness", 0.001),
     "armature": ("joint elbow armature", 0.03),
     "stiffness": ("joint elbow stiffness", 1.5),
     "rest": ("joint elbow rest", 0.2),
@@ -150,6 +151,15 @@ def test_parameters_of_every_kind_are_written(tmp_path):
         simulator, {name: number for name, (_, number) in ADDRESSES.items()}
     )
     assert difference == 0.0 and matters > 1e-3
+
+
+def test_only_the_softness_of_friction_is_written(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.format(integrator="Euler", friction=0.2, solver=""))
+    simulator = MujocoSimulator(path, {"softness": "joint * friction_softness"})
+    difference, matters = largest_difference(simulator, {"softness": 0.001})
+    assert difference == 0.0 and matters > 1e-3
+    assert (tmp_path / "identified.xml").read_text().count("solimpfriction") == 4
 
 
 def test_servos_defaults_and_includes(tmp_path):

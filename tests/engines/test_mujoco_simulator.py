@@ -175,6 +175,41 @@ def test_servo_gain_is_gain_and_bias():
     assert torch.equal(out, stiff.simulate({}, inputs))
 
 
+def test_a_loaded_joint_creeps_in_proportion_to_the_softness_of_its_friction(tmp_path):
+    path = tmp_path / "held.xml"
+    path.write_text(
+        '<mujoco><option timestep="0.001"/><worldbody><body>'
+        '<joint name="j" axis="0 1 0" armature="0.03" frictionloss="0.4"/>'
+        '<geom size="0.001" pos="0.1 0 0" mass="0.15"/></body></worldbody></mujoco>'
+    )
+    simulator = MujocoSimulator(path, {"softness": "joint j friction_softness"})
+    assert simulator.parameters[0].nominal == pytest.approx(0.1)
+    softness = value([0.1, 0.01, 0.001, 0.0001, 0.0])
+    inputs = Inputs.single(
+        torch.zeros(200, 0, dtype=torch.float64),
+        torch.zeros(2, dtype=torch.float64),
+        action_names=(),
+        state_names=tuple(state.name for state in simulator.states),
+        time_step=simulator.time_step,
+    )
+    speed = simulator.simulate({"softness": softness}, inputs)[:, 0, -1, 1]
+    force, inertia = 0.15 * 9.81 * 0.1, 0.03 + 0.15 * 0.1**2
+    # The engine's default time constant is 0.02 s, and its default impedance far away is 0.95.
+    expected = 0.95 * 0.02 * force * softness / (1.0 - softness) / (2.0 * inertia)
+    torch.testing.assert_close(speed[:4], expected[:4], rtol=0.02, atol=0.0)
+    assert speed[4] == speed[3]  # the hardest that the engine allows
+
+
+def test_a_factor_on_a_softness_scales_it():
+    binding = {"factor": Scale("joint * friction_softness")}
+    simulator, direct = arm(friction=0.1, parameters=binding), arm(friction=0.1)
+    direct.model.dof_solimp[:, 0] = 1.0 - 0.1 * 0.2
+    inputs = random_inputs(simulator)
+    out = simulator.simulate({"factor": value(0.2)}, inputs)
+    torch.testing.assert_close(out, direct.simulate({}, inputs), rtol=1e-9, atol=1e-9)
+    assert (out - arm(friction=0.1).simulate({}, inputs)).abs().max() > 1e-4
+
+
 def test_a_parameter_without_a_field_enters_derived_ones():
     simulator = arm(
         parameters={"payload": Parameter("payload", "kg", 0.1)},
@@ -551,6 +586,21 @@ def test_inverse_dynamics_hold_along_a_simulation():
     torch.testing.assert_close(left, dynamics.targets(motion), rtol=1e-9, atol=1e-9)
     back = dynamics.to_physical(base, {})
     assert {name: float(v) for name, v in back.items()} == truth
+
+
+def test_inverse_dynamics_do_not_contain_how_far_friction_yields():
+    friction = {"friction": "joint elbow frictionloss", "hand": "body hand mass"}
+    softness = {"softness": "joint * friction_softness"}
+    without = arm(friction=0.1, parameters=friction).inverse_dynamics
+    found = arm(friction=0.1, parameters=softness | friction).inverse_dynamics
+    assert found is not None and without is not None
+    assert found.determined == without.determined == ("friction", "hand")
+    torch.manual_seed(0)
+    columns = torch.randn(8, 20, dtype=torch.float64).unbind(0)
+    motion = Motion(columns[:2], columns[2:4], columns[4:6], columns[6:])
+    assert torch.equal(found.regressors(motion), without.regressors(motion))
+    assert torch.equal(found.targets(motion), without.targets(motion))
+    assert arm(friction=0.1, parameters=softness).inverse_dynamics is None
 
 
 @pytest.mark.parametrize(

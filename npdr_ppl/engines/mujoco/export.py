@@ -219,7 +219,7 @@ _COMPARED = (
     "body_pos", "body_quat", "body_ipos", "body_iquat", "body_mass", "body_inertia",
     "body_gravcomp", "jnt_pos", "jnt_axis", "jnt_stiffness", "jnt_stiffnesspoly", "jnt_range",
     "qpos0", "qpos_spring", "dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss",
-    "dof_solimp", "geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_solref", "site_pos",
+    "geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_solref", "site_pos",
     "actuator_gainprm", "actuator_biasprm", "actuator_dynprm", "actuator_gear",
     "actuator_forcerange", "actuator_ctrlrange", "jnt_actfrcrange", "tendon_stiffness",
     "tendon_damping", "tendon_frictionloss", "tendon_armature", "tendon_lengthspring",

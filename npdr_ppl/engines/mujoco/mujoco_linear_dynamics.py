@@ -59,7 +59,9 @@ def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None
         (is_velocity, i) for is_velocity in (False, True) for i in range(model.nv)
     ]
     arrays = bindings.arrays
-    if not (is_simple and is_whole and arrays and arrays <= _LINEAR_ARRAYS | {_SOFTNESS}):
+    if not (is_simple and is_whole and arrays & _LINEAR_ARRAYS):
+        return None
+    if not arrays <= _LINEAR_ARRAYS | {_SOFTNESS}:
         return None
     if not np.any(model.body_mass):
         return None
