@@ -10,8 +10,9 @@ from hidden_rigs import make_case
 
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.projection import Projection
+from npdr_ppl.discovery.screening.resonance_sizes import _between_unlike
 from npdr_ppl.discovery.screening.screening import screen
-from npdr_ppl.discovery.screening.sensitivities import _between_unlike, sensitivities
+from npdr_ppl.discovery.screening.sensitivities import sensitivities
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import (
@@ -62,7 +63,7 @@ def test_sizes_of_a_resonance_that_change_the_motion_alike_are_left_out(quiet, m
     effects = (JointElasticity("hinge"),)
     few = list(sensitivities(quiet, effects))
     every = replace(SENSITIVITY, resonance_stride=1)
-    monkeypatch.setattr("npdr_ppl.discovery.screening.sensitivities.SENSITIVITY", every)
+    monkeypatch.setattr("npdr_ppl.discovery.screening.resonance_sizes.SENSITIVITY", every)
     all_sizes = list(sensitivities(quiet, effects))
     assert len(few) < len(all_sizes) == len(SENSITIVITY.resonant_sizes)
     projection = Projection(quiet)
