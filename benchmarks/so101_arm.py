@@ -4,13 +4,15 @@
 
 The six motions are every third one in the order of the alphabet. The model is the arm's MJCF file
 in MuJoCo with all six joints. Of each servo, kp, kv (with the damping of its joint), armature, dry
-friction and how far it yields are fitted, and what ``--laws`` adds. Masses stay those of the file, whose weight sets
-the scale of all torques.
+friction and how far it yields are fitted, and what ``--laws`` adds. Masses stay those of the file,
+whose weight sets the scale of all torques.
 
 Behind stiff servos the joints nearly decouple: another kp of the wrist hardly moves the shoulder.
 Each Gauss-Newton step therefore changes the same number of all six servos in one simulation, and
 solves for each joint alone. Six joints cost as many simulations as one. The misfit is that of
 whole motions, simulated from the first sample without resynchronisation, as the result is judged.
+In places the arm touches something, which the file does not contain, so errors above
+``LARGE_ERROR`` count in proportion to their size, not to its square (Huber 1964).
 """
 
 import argparse
@@ -58,6 +60,9 @@ STEPS |= {"delay": 2e-3, "offset": 1e-3}
 LARGEST = {"kp": 0.7, "kv": 0.7, "armature": 0.7, "friction": 0.7, "softness": 1.5}
 LARGEST |= {"delay": 0.015, "offset": 0.02}
 """Largest changes in one step, in the same units."""
+
+LARGE_ERROR = 0.01
+"""Errors in rad from which the arm may have touched something: 6.5 steps of its encoders."""
 
 ADDITIVE = ("delay", "offset")
 """Numbers that are not changed in logarithms."""
@@ -161,6 +166,13 @@ def squares(simulated: Tensor, recorded: Motions) -> Tensor:
     return error.square().mean(-2).nan_to_num(math.inf)
 
 
+def losses(simulated: Tensor, recorded: Motions) -> Tensor:
+    """Returns the mean loss of each joint over all samples, ``(draws, joints)``, rad²."""
+    size = (simulated - recorded.measured)[:, recorded.inputs.mask].abs()
+    straight = LARGE_ERROR * (2.0 * size - LARGE_ERROR)
+    return torch.where(size < LARGE_ERROR, size.square(), straight).mean(-2).nan_to_num(math.inf)
+
+
 def fitted(arm: Arm, recorded: Motions, rounds: int) -> dict[str, Tensor]:
     """Fits the numbers of all joints; returns each, ``(joints,)``.
 
@@ -179,13 +191,15 @@ def fitted(arm: Arm, recorded: Motions, rounds: int) -> dict[str, Tensor]:
             step = torch.as_tensor(STEPS[number], dtype=torch.float64)
             tried[number][row] = arm.changed(values, number, step)
         simulated = arm.simulate(tried, recorded)
-        now = squares(simulated[:1], recorded)[0]
+        now = losses(simulated[:1], recorded)[0]
         base = simulated[0][mask]  # (samples, joints)
         steps = torch.tensor([STEPS[number] for number in arm.numbers], dtype=torch.float64)
         slopes = torch.stack([s[mask] - base for s in simulated[1:]], -1) / steps
         residual = recorded.measured[mask] - base
-        curvature = torch.einsum("tjm,tjn->jmn", slopes, slopes)
-        gradient = torch.einsum("tjm,tj->jm", slopes, residual)
+        # The square of a large residual is replaced by one with the slope of its loss.
+        weights = (LARGE_ERROR / residual.abs().clamp_min(LARGE_ERROR))[..., None]
+        curvature = torch.einsum("tjm,tjn->jmn", weights * slopes, slopes)
+        gradient = torch.einsum("tjm,tj->jm", weights * slopes, residual)
         moves = []
         for factor in DAMPINGS:
             diagonal = torch.diag_embed(curvature.diagonal(dim1=-2, dim2=-1))
@@ -195,16 +209,16 @@ def fitted(arm: Arm, recorded: Motions, rounds: int) -> dict[str, Tensor]:
         limits = torch.tensor([LARGEST[number] for number in arm.numbers], dtype=torch.float64)
         move = torch.maximum(torch.minimum(move, limits), -limits)
         tried = {n: arm.changed(values, n, move[..., k]) for k, n in enumerate(arm.numbers)}
-        losses = squares(arm.simulate(tried, recorded), recorded)
-        best = losses.argmin(0)
+        found = losses(arm.simulate(tried, recorded), recorded)
+        best = found.argmin(0)
         joint = torch.arange(len(JOINTS))
-        is_better = losses[best, joint] < now
+        is_better = found[best, joint] < now
         for number in arm.numbers:
             chosen = tried[number][best, joint]
             values[number] = torch.where(is_better, chosen, values[number])
         shown = "  ".join(f"{1e3 * value:.2f}" for value in now.sqrt().tolist())
         spent = time.process_time() - begun
-        print(f"step {turn}: RMSE {shown} mrad, {spent:.0f} s of CPU", flush=True)
+        print(f"step {turn}: root of the loss {shown} mrad, {spent:.0f} s of CPU", flush=True)
         if not bool(is_better.any()):
             break
     return values

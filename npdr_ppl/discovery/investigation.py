@@ -161,7 +161,9 @@ class Investigation:
         searcher = self._searcher
         with self.progress.timed("fit"):
             step = self.progress.stage("fit the original model")
-            fitted = searcher.fit_base(may_be_rough=True, progress=step)
+            fitted = searcher.fit_base(
+                near=self._repair.parameters, may_be_rough=True, progress=step
+            )
         return fitted
 
     @cached_property

@@ -20,7 +20,7 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.remedies import Remedy, Shift, remedies, without_one
 from npdr_ppl.discovery.screening.encoder_resolution import count_of
-from npdr_ppl.discovery.search.base_fit import fit_base
+from npdr_ppl.discovery.search.base_fit import searched_fit
 from npdr_ppl.discovery.search.prior_ends import with_widest_priors
 from npdr_ppl.discovery.settings import REPAIR
 from npdr_ppl.errors import DataError, NpdrError
@@ -52,11 +52,14 @@ class Repair:
             recording is as it was.
         remedies: The remedies that were applied; other recordings of the same device need them,
             too.
+        parameters: Parameters that are close to the recording, ``None`` if they were not searched
+            for. A fit may begin there.
     """
 
     rollouts: Rollouts
     simulator: Simulator | None
     remedies: tuple[Remedy, ...] = ()
+    parameters: Mapping[str, Tensor] | None = None
 
     def applied_to(self, other: Rollouts) -> Rollouts:
         """Returns another recording of the device with the same remedies, without its own faults.
@@ -119,15 +122,17 @@ def repair(
         # Run as inference will run it, so that the model's own mistakes are reported first.
         tried = Prior(model, (options.with_certain_start().inputs(rollouts),))
         tried.execute(tried.sample(2))
+    parameters = None
     while len(applied) < REPAIR.most_remedies:
-        remedy = _remedy_for(model, rollouts, options, report)
+        remedy, parameters = _remedy_for(model, rollouts, options, report)
         if remedy is None:
             break
+        parameters = None
         applied.append(remedy)
         rollouts = remedy.apply(rollouts)
         rollouts = replace(rollouts, notes=(*rollouts.notes, remedy.sentence))
         _refuse_if_strict(rollouts, options)
-    return Repair(rollouts, simulator, tuple(applied))
+    return Repair(rollouts, simulator, tuple(applied), parameters)
 
 
 def _takes_inputs(model: Model) -> bool:
@@ -171,19 +176,45 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
 
 def _remedy_for(
     model: Model, rollouts: Rollouts, options: DataOptions, report: Callable[[str], None]
-) -> Remedy | None:
-    """Returns the remedy that explains a recording best, if the recording is not explained."""
-    windows = _Windows(rollouts, options)
+) -> tuple[Remedy | None, Mapping[str, Tensor] | None]:
+    """Returns the remedy that explains a recording best, if the recording is not explained.
+
+    The second result is where the parameters of the recording as it was read are, if they were
+    searched for.
+    """
+    windows, found = _Windows(rollouts, options), None
     report("checking the recording: a rough fit of it as it was read")
     as_read = windows.fitted(model, rollouts)
     if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
         # Before data are blamed, the parameters are searched for as thoroughly as for a fit.
         report("checking the recording: a thorough fit, because the rough one leaves much")
         searched = _searched(as_read.segments)
-        if searched is not None and _rms(_misfits(searched)) < _rms(_misfits(as_read)):
-            as_read = searched
+        if searched is not None:
+            as_read = min(as_read, searched, key=lambda each: _rms(_misfits(each)))
+            found = as_read.parameters
     if as_read is not None and _rms(_misfits(as_read)) < REPAIR.large_residual:
-        return None
+        return None, found
+    return _trusted_remedy(model, rollouts, options, windows, as_read, report), found
+
+
+def _trusted_remedy(
+    model: Model,
+    rollouts: Rollouts,
+    options: DataOptions,
+    windows: "_Windows",
+    as_read: Hypothesis | None,
+    report: Callable[[str], None],
+) -> Remedy | None:
+    """Returns the remedy that explains a recording best; ``None`` if none explains enough.
+
+    Args:
+        model: The model.
+        rollouts: The recording.
+        options: How it is cut into segments.
+        windows: The segments along which remedies are tried.
+        as_read: The fit of the recording as it was read; ``None`` if simulations fail.
+        report: Called with a short status.
+    """
     report("checking the recording: trying other units, signs and time stamps")
     trials = _Trials(model, rollouts, windows, as_read)
     present, ratio = trials.present, trials.ratio
@@ -382,7 +413,7 @@ def _refined(shift: Shift, ratio: Callable[[Remedy], float]) -> tuple[Remedy, fl
 def _searched(segments: SegmentModel) -> Hypothesis | None:
     """Returns a rough fit that begins at the result of a search; ``None`` if simulations fail."""
     try:
-        found, _ = fit_base(segments)
+        found, _ = searched_fit(segments)
         return fit_segment_model(segments, start=found.parameters, max_steps=6, is_rough=True)
     except DataError:
         return None

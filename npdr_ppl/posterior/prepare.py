@@ -212,7 +212,9 @@ def prepare(
         data_options=data_options,
         seed=seed,
     )
-    closest = searcher.fit_base(near=near, may_be_rough=True, progress=progress)
+    closest = searcher.fit_base(
+        near=near or repaired.parameters, may_be_rough=True, progress=progress
+    )
     step(None, "compare with finer integration steps")
     finer = searcher.with_finer_steps(closest, is_rough=True)
     closest = searcher.converged(finer)

@@ -22,6 +22,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.language.channels import Channel, Parameter, Port
 from npdr_ppl.models.cart_pole import cart_pole
 from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.rollouts.notes import Remark
 from tests.helpers.pendulum_recordings import swinging
 from tests.helpers.rig_recordings import recording_of
@@ -213,6 +214,28 @@ def test_remedies_of_the_whole_recording_are_fewer():
     )
 
 
+def test_a_fit_begins_where_the_check_has_searched(monkeypatch):
+    """A search of the priors takes minutes on a whole arm, and one is enough."""
+    begun = []
+
+    def fitted(segments, *, near, **options):
+        begun.append(near)
+        raise DataError("enough")
+
+    monkeypatch.setattr("npdr_ppl.discovery.search.original_model.fit_base", fitted)
+    rollouts, options = swinging(steps=90), npdr.DataOptions(None, 30)
+    for large in (0.0, 1.0):  # the rough fit leaves much, or little
+        settings = dataclasses.replace(recording_repair.REPAIR, large_residual=large)
+        monkeypatch.setattr(recording_repair, "REPAIR", settings)
+        monkeypatch.setattr(recording_repair, "_trusted_remedy", lambda *_: None)
+        for prepared in (prepare, npdr.discover):
+            with pytest.raises(DataError, match="enough"):
+                prepared(pendulum, rollouts, options=options)
+    searched, again, *others = begun
+    assert searched.keys() == again.keys() == {"mass", "length"}
+    assert others == [None, None]
+
+
 @pytest.mark.slow
 def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is(monkeypatch):
     """A fit that got stuck is no fault of the data."""
@@ -234,7 +257,7 @@ def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is
     shift = Shift(None, 1).remedy
     assert trials.ratio(shift) < recording_repair.REPAIR.remedy_factor
     assert trials.ratio_without(shift) < trials.ratio(shift)
-    assert recording_repair._remedy_for(pendulum, rollouts, options, print) is None
+    assert recording_repair._remedy_for(pendulum, rollouts, options, print) == (None, None)
 
 
 class Wheel(ODESimulator):
@@ -293,7 +316,7 @@ def test_a_remedy_that_leaves_much_must_beat_wider_priors(monkeypatch, wider, is
     monkeypatch.setattr(trials, "ratio_without", lambda trials, remedy: 1.0)
     monkeypatch.setattr(trials, "ratio_with_wider_priors", lambda trials, as_read: wider)
     options = npdr.DataOptions(None, 20)
-    found = recording_repair._remedy_for(wheel, turned(20.0, 1.0), options, print)
+    found, _ = recording_repair._remedy_for(wheel, turned(20.0, 1.0), options, print)
     assert (found is not None) == is_applied
 
 

@@ -31,7 +31,7 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 
-__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends", "polished"]
+__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends", "polished", "searched_fit"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,43 @@ def fit_base(
     may_be_rough: bool = False,
     progress: Step | None = None,
 ) -> tuple[Hypothesis, Mapping[str, Tensor] | None]:
-    """Fits a model to a recording, without adding effects.
+    """Fits a model to a recording, without adding effects, and its initial states along that fit.
+
+    Args:
+        segments: The model along the recording.
+        near: See :func:`searched_fit`, as all others.
+        seed: Seed of the search.
+        may_be_rough: Whether a rough fit may be enough.
+        progress: Called with a short status.
+
+    Returns:
+        The fit, and if it is rough, parameters from which a fit in finer steps may begin.
+
+    Raises:
+        DataError: No parameters can be simulated along the recording, or simulations fail close
+            to the fit.
+    """
+    fitted, finer_parameters = searched_fit(
+        segments, near=near, seed=seed, may_be_rough=may_be_rough, progress=progress
+    )
+    if finer_parameters is None:
+        fitted = off_the_ends(fitted)
+        if progress is not None:
+            progress(None, "fit with better initial states")
+        fitted = Trials(segments).with_own_starts(fitted)
+    _ = fitted.linearisation  # computed now, because all later steps need it
+    return fitted, finer_parameters
+
+
+def searched_fit(
+    segments: SegmentModel,
+    *,
+    near: Mapping[str, Tensor] | None = None,
+    seed: int = 0,
+    may_be_rough: bool = False,
+    progress: Step | None = None,
+) -> tuple[Hypothesis, Mapping[str, Tensor] | None]:
+    """Searches for the parameters closest to a recording, with the smoother's initial states.
 
     Args:
         segments: The model along the recording.
@@ -71,11 +107,10 @@ def fit_base(
         progress: Called with a short status, and during the search with the fraction of it done.
 
     Returns:
-        The fit, and if it is rough, parameters from which a fit in finer steps may begin.
+        As :func:`fit_base`.
 
     Raises:
-        DataError: No parameters can be simulated along the recording, or simulations fail close
-            to the fit.
+        DataError: No parameters can be simulated along the recording.
     """
     step = progress or (lambda fraction, status: None)
     begun: list[Hypothesis] = []
@@ -115,11 +150,6 @@ def fit_base(
     if fitted is None:
         assert failure is not None
         raise failure
-    if not is_rough:
-        fitted = off_the_ends(fitted)
-        step(None, "fit with better initial states")
-        fitted = Trials(segments).with_own_starts(fitted)
-    _ = fitted.linearisation  # computed now, because all later steps need it
     return fitted, finer_parameters
 
 
