@@ -246,8 +246,7 @@ class _Windows:
 
     Attributes:
         options: How a recording is cut into segments.
-        few: A part of them, which shows the remedies that help little; ``None`` if the recording
-            is short.
+        few: A part of them, which shows the remedies that help little; ``None`` if they are few.
     """
 
     def __init__(self, rollouts: Rollouts, options: DataOptions) -> None:
@@ -255,16 +254,16 @@ class _Windows:
         self.options = options
         self.few: _Windows | None = None
         self._places: list[tuple[int, int]] | None = None
-        used = options.used_segments(rollouts)
-        if len(used) <= REPAIR.most_segments:
-            return
-        length = options.steps(rollouts)
-        weights = motion(rollouts, length)[used]
-        index = one_of_each_part(REPAIR.most_segments, len(used), seed=0, weights=weights)
+        used, length = options.used_segments(rollouts), options.steps(rollouts)
         layout = layout_of(rollouts, length)
-        self._places = [layout[k][:2] for k in used[index].tolist()]
-        self.few = copy.copy(self)
-        self.few._places = self._places[:: REPAIR.part_of_first_trials]
+        if len(used) > REPAIR.most_segments:
+            weights = motion(rollouts, length)[used]
+            used = used[one_of_each_part(REPAIR.most_segments, len(used), seed=0, weights=weights)]
+            self._places = [layout[k][:2] for k in used.tolist()]
+        if len(used) >= REPAIR.part_of_first_trials * REPAIR.fewest_first:
+            self.few = copy.copy(self)
+            few = used[:: REPAIR.part_of_first_trials]
+            self.few._places = [layout[k][:2] for k in few.tolist()]
 
     def fitted(
         self, model: Model, rollouts: Rollouts, start: Mapping[str, Tensor] | None = None

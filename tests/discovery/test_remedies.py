@@ -331,8 +331,8 @@ def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypa
     assert (moved.start - whole.start).abs().max() <= 10
 
 
-def test_of_a_long_recording_only_hopeful_remedies_are_tried_along_all_segments(monkeypatch):
-    settings = dataclasses.replace(recording_repair.REPAIR, most_segments=16)
+def test_only_hopeful_remedies_are_tried_along_all_segments(monkeypatch):
+    settings = dataclasses.replace(recording_repair.REPAIR, most_segments=16, fewest_first=4)
     monkeypatch.setattr(recording_repair, "REPAIR", settings)
     rollouts = _ScaledAction("torque", -1.0)(turned(1.0, 1.0))
     windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 20))
