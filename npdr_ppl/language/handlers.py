@@ -179,12 +179,12 @@ class ModelWithFinerSteps(Layer):
 
 
 class CoarserStepsMessenger(Messenger):
-    """Gives a program's simulators back their own steps while it runs, if these were refined."""
+    """Gives a program's simulators their coarser steps while it runs, if they have some."""
 
     def _pyro_sample(self, msg: Any) -> None:
         box = msg["fn"]
         if isinstance(box, SimulatorBlackBox):
-            coarser = box.simulator.with_coarser_steps()
+            coarser = box.simulator.with_coarser_steps(time_step=box.inputs.time_step)
             if coarser is not None:
                 msg["fn"] = box.with_simulator(coarser)
 

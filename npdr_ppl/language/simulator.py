@@ -138,7 +138,9 @@ class Simulator(ABC):
         """Returns a copy with smaller integration errors; ``None`` if there is none."""
         return None
 
-    def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
+    def with_coarser_steps(
+        self, num_simulations: float = math.inf, time_step: float | None = None
+    ) -> Self | None:
         """Returns a copy that costs much less, from which finer steps differ almost constantly.
 
         Differences between simulations of similar parameters are then almost the same in both.
@@ -147,6 +149,7 @@ class Simulator(ABC):
         Args:
             num_simulations: How many simulations of a segment it would be used for. One more of
                 every segment with each of both steps tells what the coarser ones miss.
+            time_step: Seconds per step of the recording; the simulator's own by default.
         """
         return None
 

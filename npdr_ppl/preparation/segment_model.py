@@ -168,7 +168,7 @@ class SegmentModel:
             unstable: simulations at the point fail, or miss more than the recording's size.
         """
         num_simulations = num_draws * self.inputs.num_segments
-        if self.simulator.with_coarser_steps(num_simulations) is None:
+        if self.simulator.with_coarser_steps(num_simulations, self.inputs.time_step) is None:
             return self
         coarser = self.with_model(with_coarser_steps(self.model))
         here = z[None], offsets[None]

@@ -70,7 +70,7 @@ def segments(request):
 
 def in_fine_steps_only(monkeypatch):
     for simulator in (MujocoSimulator, ODESimulator):
-        monkeypatch.setattr(simulator, "with_coarser_steps", lambda self, num=0: None)
+        monkeypatch.setattr(simulator, "with_coarser_steps", lambda self, *_, **__: None)
 
 
 def test_finer_steps_lead_back_to_the_files_own():
@@ -81,6 +81,20 @@ def test_finer_steps_lead_back_to_the_files_own():
     assert coarser.num_substeps(0.02) == 1
     assert coarser.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert coarser.with_coarser_steps() is None
+
+
+def test_several_steps_per_sample_become_half_as_many():
+    assert SIMULATOR.with_coarser_steps(time_step=0.06) is None
+    friction = CoulombFriction("hinge")
+    coarser = SIMULATOR.with_effects(friction).with_coarser_steps(time_step=0.1)
+    assert coarser.effects == (friction,)
+    assert (SIMULATOR.num_substeps(0.1), coarser.num_substeps(0.1)) == (5, 3)
+    assert coarser.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    assert SIMULATOR.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert coarser.with_coarser_steps(time_step=0.1) is None
+    # Refined steps lead back to the file's own first.
+    again = SIMULATOR.with_finer_steps().with_coarser_steps(time_step=0.1)
+    assert again.num_substeps(0.1) == 5
 
 
 def test_steps_of_order_four_lead_to_midpoint_steps_where_these_save_time(monkeypatch):

@@ -215,7 +215,7 @@ def test_the_likelihood_of_other_starts_is_that_of_one_normal_distribution(
     likelihood, monkeypatch
 ):
     """With C = 1 + G Gᵀ written out, as the closed form would have it."""
-    monkeypatch.setattr(ODESimulator, "with_coarser_steps", lambda self, num=0: None)
+    monkeypatch.setattr(ODESimulator, "with_coarser_steps", lambda self, *_, **__: None)
     likelihood = replace(likelihood, share=0.3)
     z = likelihood.fit.z[None] + torch.tensor([[0.0, 0.0], [0.01, -0.02]], dtype=torch.float64)
     now, segments = likelihood.linearisation, likelihood.segments

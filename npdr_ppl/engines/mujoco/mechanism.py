@@ -110,6 +110,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         self.substeps, self.num_threads = substeps, num_threads
         # Engine steps per requested engine step; see MujocoSimulator.with_finer_steps.
         self.refinement = 1
+        self.coarsening = 1
         self.time_step = time_step or (substeps or 1) * float(self.model.opt.timestep)
         self._declare_channels(states, sensors, units or {}, bounds or {})
         taken = [channel.name for channel in (*self.states, *self.sensors, *self.actions)]
@@ -169,7 +170,7 @@ class MujocoMechanism(ClosedLoopSimulator):
     def num_substeps(self, time_step: float) -> int:
         """Returns the engine steps per control step of ``time_step`` seconds."""
         suggested = max(1, round(time_step / float(self.model.opt.timestep)))
-        return self.refinement * (self.substeps or suggested)
+        return -(-self.refinement * (self.substeps or suggested) // self.coarsening)
 
     def histories(self, given: Mapping[str, Tensor], time_step: float) -> tuple[int, ...]:
         """Returns how many past steps each action effect, then each sensor effect, needs.

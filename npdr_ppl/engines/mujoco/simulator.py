@@ -39,6 +39,15 @@ _MOST_DAMPED = 2.5
 stable up to 2.8; an arm's inertia changes as it moves."""
 
 
+_COARSER = 2
+"""How many times fewer steps :meth:`MujocoSimulator.with_coarser_steps` takes where the file's own
+are several per sample. On the SO-101 at 50 Hz, steps of 4 ms in place of 2 ms change derivatives
+by 0.8 % (median of 29 parameters; 10 % at most), and steps of order four change them as much."""
+
+_MANY_STEPS = 4
+"""Number of engine steps per sample from which half of them are enough for derivatives."""
+
+
 class MujocoSimulator(MujocoMechanism):
     """Any MJCF file as a simulator; channels, nominal values and ports are read from it.
 
@@ -126,15 +135,30 @@ class MujocoSimulator(MujocoMechanism):
             changed.model.opt.integrator = rk4
         return changed
 
-    def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
-        """Returns a copy with the file's own steps; ``None`` if these are its steps."""
+    def with_coarser_steps(
+        self, num_simulations: float = math.inf, time_step: float | None = None
+    ) -> Self | None:
+        """Returns a copy with the file's own steps, or with half as many if these are its steps.
+
+        ``None`` if there are few steps per sample already. Half as many steps are implicit where
+        the file's are Euler's, because stiff servos could make those unstable.
+        """
         if self.rigid is not None:
-            coarser = self.rigid.with_coarser_steps(num_simulations)
+            coarser = self.rigid.with_coarser_steps(num_simulations, time_step)
             return coarser and coarser.carrying(self.effects)
-        if self.unrefined is None:
+        if self.unrefined is not None:
+            changed = copy.copy(self.unrefined)
+            changed.effects = self.effects
+            return changed
+        is_coarse = self.coarsening > 1
+        if is_coarse or self.num_substeps(time_step or self.time_step) < _MANY_STEPS:
             return None
-        changed = copy.copy(self.unrefined)
-        changed.effects = self.effects
+        mujoco: Any = importlib.import_module("mujoco")
+        changed = copy.copy(self)
+        changed.prepared_models, changed.coarsening = {}, _COARSER
+        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+            changed.model = copy.copy(self.model)
+            changed.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:

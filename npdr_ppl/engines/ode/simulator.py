@@ -62,7 +62,9 @@ class ODESimulator(MechanicalSystem):
         changed.substeps, changed.is_finest = 2 * self.substeps, True
         return changed
 
-    def with_coarser_steps(self, num_simulations: float = math.inf) -> Self | None:
+    def with_coarser_steps(
+        self, num_simulations: float = math.inf, time_step: float | None = None
+    ) -> Self | None:
         """Returns a copy with midpoint steps in place of Runge-Kutta steps of order four."""
         coarser = integrator(COARSER)
         if self.integrator.order <= coarser.order or num_simulations < COARSER_SIMULATIONS:
