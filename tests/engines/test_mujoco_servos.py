@@ -10,7 +10,7 @@ import torch
 from pyro.distributions import Normal
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery.screening.sensitivities import _probe
+from npdr_ppl.discovery.screening.probes import probe_of
 from npdr_ppl.discovery.screening.settings import SENSITIVITY
 from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.errors import ModelError
@@ -360,20 +360,20 @@ def test_a_filtered_servo_has_no_dead_band():
 
 def test_integral_action_is_tried_at_typical_rates():
     given = IntegralAction("goal").probe(joint().port("goal"))["rate"]
-    tried = _probe(IntegralAction("goal"), goals(np.zeros(10)), joint(), None)
+    tried = probe_of(IntegralAction("goal"), goals(np.zeros(10)), joint(), None)
     assert {run["rate"] for run in tried.runs} == {size * given for size in SENSITIVITY.sizes}
 
 
 def test_limits_are_tried_below_what_they_would_cut_off():
     simulator = joint()
     inputs = goals(0.5 * np.sin(np.linspace(0.0, 9.0, 100)))
-    force = _probe(ServoForceLimit("goal"), inputs, simulator, None)
+    force = probe_of(ServoForceLimit("goal"), inputs, simulator, None)
     limits = [values["limit"] for values, _, _ in force.cases]
     assert limits == sorted(limits, reverse=True)
     assert len(limits) == len(SENSITIVITY.limit_quantiles)
     assert [float(zero) * SENSITIVITY.first_limit for zero in force.nominal] == pytest.approx(
         limits
     )
-    clipped = _probe(Saturation("goal"), inputs, simulator, None)
+    clipped = probe_of(Saturation("goal"), inputs, simulator, None)
     peak = float(inputs.actions.abs().max())
     assert {values["limit"] for values, _, _ in clipped.cases} == {SENSITIVITY.first_limit * peak}
