@@ -108,7 +108,13 @@ class Investigation:
     def _repair(self) -> Repair:
         with self.progress.timed("check data"):
             self.progress.say("checking the recording")
-            found = repair(self.model, self.recorded, self._data_options, report=self.progress.say)
+            found = repair(
+                self.model,
+                self.recorded,
+                self._data_options,
+                seed=self.seed,
+                report=self.progress.say,
+            )
         simulator = found.simulator
         for effect in self.settings.effects or ():
             # Screening skips effects that the simulator cannot have; requested ones raise errors.

@@ -83,6 +83,7 @@ def repair(
     rollouts: Rollouts,
     options: DataOptions,
     *,
+    seed: int = 0,
     report: Callable[[str], None] = lambda status: None,
 ) -> Repair:
     """Returns a recording that is ready to be fitted.
@@ -91,6 +92,7 @@ def repair(
         model: A Pyro model with one simulator.
         rollouts: The recording.
         options: How it is cut into segments.
+        seed: Seed of a search of the priors.
         report: Called with a short status before each long step.
 
     Raises:
@@ -124,7 +126,7 @@ def repair(
         tried.execute(tried.sample(2))
     parameters = None
     while len(applied) < REPAIR.most_remedies:
-        remedy, parameters = _remedy_for(model, rollouts, options, report)
+        remedy, parameters = _remedy_for(model, rollouts, options, report, seed)
         if remedy is None:
             break
         parameters = None
@@ -175,11 +177,15 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
 
 
 def _remedy_for(
-    model: Model, rollouts: Rollouts, options: DataOptions, report: Callable[[str], None]
+    model: Model,
+    rollouts: Rollouts,
+    options: DataOptions,
+    report: Callable[[str], None],
+    seed: int = 0,
 ) -> tuple[Remedy | None, Mapping[str, Tensor] | None]:
     """Returns the remedy that explains a recording best, if the recording is not explained.
 
-    The second result is where the parameters of the recording as it was read are, if they were
+    The second result is the closest parameters to the recording as it was read, if they were
     searched for.
     """
     windows, found = _Windows(rollouts, options), None
@@ -188,7 +194,7 @@ def _remedy_for(
     if as_read is not None and _rms(_misfits(as_read)) >= REPAIR.large_residual:
         # Before data are blamed, the parameters are searched for as thoroughly as for a fit.
         report("checking the recording: a thorough fit, because the rough one leaves much")
-        searched = _searched(as_read.segments)
+        searched = _searched(as_read.segments, seed)
         if searched is not None:
             as_read = min(as_read, searched, key=lambda each: _rms(_misfits(each)))
             found = as_read.parameters
@@ -409,10 +415,10 @@ def _refined(shift: Shift, ratio: Callable[[Remedy], float]) -> tuple[Remedy, fl
     return remedy, least
 
 
-def _searched(segments: SegmentModel) -> Hypothesis | None:
+def _searched(segments: SegmentModel, seed: int) -> Hypothesis | None:
     """Returns a rough fit that begins at the result of a search; ``None`` if simulations fail."""
     try:
-        found, _ = searched_fit(segments)
+        found, _ = searched_fit(segments, seed=seed)
         return fit_segment_model(segments, start=found.parameters, max_steps=6, is_rough=True)
     except DataError:
         return None

@@ -30,7 +30,8 @@ class RepairSettings:
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
             or a clock is wrong in the whole recording. With the default length they last 40 s.
         part_of_first_trials: A remedy is first tried along every n-th of these segments.
-        fewest_first: Fewest segments of these first trials: with fewer, all may rest by chance.
+        fewest_first: Fewest segments of these first trials: with fewer, the device may be
+            at rest in all of them.
         hopeless_ratio: Residual of this trial, relative to that of the recording as it was read,
             from which the remedy is not tried along all of them. It is above ``remedy_factor``, so
             that a remedy is not missed because its residual differs between the segments.

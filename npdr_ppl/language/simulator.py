@@ -141,7 +141,7 @@ class Simulator(ABC):
     def with_coarser_steps(
         self, num_simulations: float = math.inf, time_step: float | None = None
     ) -> Self | None:
-        """Returns a copy that costs much less, from which finer steps differ almost constantly.
+        """Returns a copy that costs less, from which finer steps differ almost constantly.
 
         Differences between simulations of similar parameters are then almost the same in both.
         ``None`` if there is no such copy, or if it saves nothing.

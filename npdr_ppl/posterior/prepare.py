@@ -195,7 +195,9 @@ def prepare(
     """
     step = progress or (lambda fraction, status: None)
     step(None, "check the recording")
-    repaired = repair(model, rollouts, options, report=lambda status: step(None, status))
+    repaired = repair(
+        model, rollouts, options, seed=seed, report=lambda status: step(None, status)
+    )
     rollouts = repaired.rollouts
     prior = Prior(model, (options.with_certain_start().inputs(rollouts),))
     is_declared = any(box.noise is not None for box in prior.black_boxes.values())

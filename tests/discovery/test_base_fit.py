@@ -1,11 +1,31 @@
 """Steps of a fit that are fine enough for its parameters."""
 
+import torch
 from clean_fits_conditions import made
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.hypothesis import fit_segment_model
 from npdr_ppl.discovery.search import base_fit, original_model
 from npdr_ppl.discovery.search.effect_search import Searcher
+from npdr_ppl.errors import DataError
 from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.preparation.segment_model import SegmentModel
+from tests.helpers.pendulum_recordings import swinging
+
+
+def test_a_fit_that_cannot_begin_where_it_is_expected_is_searched_for(monkeypatch):
+    near, begun = {"mass": torch.tensor(1.0)}, []
+
+    def failing(segments, *, start, **options):
+        begun.append(start)
+        if start is near:
+            raise DataError("It cannot be simulated.")
+        return fit_segment_model(segments, start=start, **options)
+
+    monkeypatch.setattr(base_fit, "fit_segment_model", failing)
+    segments = SegmentModel(pendulum, swinging(steps=90), npdr.DataOptions(None, 30))
+    found, _ = base_fit.searched_fit(segments, near=near)
+    assert begun[0] is near and bool(found.fit.z.isfinite().all())
 
 
 def test_steps_are_refined_until_parameters_do_not_compensate_for_them():

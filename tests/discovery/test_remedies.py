@@ -250,7 +250,7 @@ def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is
         return found
 
     monkeypatch.setattr(recording_repair._Windows, "fitted", stuck)
-    monkeypatch.setattr(recording_repair, "_searched", lambda segments: None)
+    monkeypatch.setattr(recording_repair, "_searched", lambda *_: None)
     windows = recording_repair._Windows(rollouts, options)
     as_read = windows.fitted(pendulum, rollouts)
     trials = recording_repair._Trials(pendulum, rollouts, windows, as_read)

@@ -12,6 +12,7 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco import Scale
 from npdr_ppl.engines.mujoco.derived_model import derive_model
+from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
 
@@ -252,6 +253,20 @@ def test_small_friction_beside_a_stiff_servo_has_an_effect(tmp_path):
     names = [p.name for p in derived.parameters]
     assert names == ["j_frictionloss", "j_command_kp", "j_command_kv", "friction_softness"]
     assert list(derived.held) == ["body link mass_and_inertia"]
+
+
+def test_the_softness_of_friction_is_that_of_joints_with_friction(tmp_path):
+    path = tmp_path / "floating.xml"
+    path.write_text(
+        "<mujoco><worldbody><body name='base'><freejoint name='root'/><geom size='0.1'/>"
+        "<body name='link'><joint name='knee' axis='0 1 0' frictionloss='0.05'/>"
+        "<geom size='0.05' pos='0 0 -0.1'/><body><joint axis='1 0 0'/><geom size='0.05'/></body>"
+        "</body></body></worldbody></mujoco>"
+    )
+    robot = loaded(derive_model(path).source(path))["robot"]
+    assert {place for array, place in robot.bindings.places if array == "dof_solimp"} == {30}
+    exported = export_mjcf(robot, {"friction_softness": torch.tensor(0.001)})
+    assert exported.text.count("solimpfriction") == 2  # the attribute and the comment
 
 
 def test_friction_whose_hardness_the_file_sets_keeps_it(arm):

@@ -200,6 +200,20 @@ def test_a_loaded_joint_creeps_in_proportion_to_the_softness_of_its_friction(tmp
     assert speed[4] == speed[3]  # the hardest that the engine allows
 
 
+def test_friction_of_an_effect_has_the_softness_of_its_joint():
+    friction = CoulombFriction("elbow_torque")
+    given = {f"{friction.name}.magnitude": value(0.3)}
+    hard = arm().with_effects(friction)
+    bound = arm(parameters={"softness": "joint elbow friction_softness"}).with_effects(friction)
+    inputs = random_inputs(hard)
+    plain = bound.simulate(given, inputs)
+    nominal = {"softness": value(bound.parameters[0].nominal)}
+    assert torch.equal(plain, bound.simulate(given | nominal, inputs))
+    assert not torch.equal(plain, hard.simulate(given, inputs))
+    with pytest.raises(ModelError, match="no such joint has dry friction"):
+        arm(parameters={"softness": "joint * friction_softness"})
+
+
 def test_a_factor_on_a_softness_scales_it():
     binding = {"factor": Scale("joint * friction_softness")}
     simulator, direct = arm(friction=0.1, parameters=binding), arm(friction=0.1)
@@ -601,6 +615,9 @@ def test_inverse_dynamics_do_not_contain_how_far_friction_yields():
     assert torch.equal(found.regressors(motion), without.regressors(motion))
     assert torch.equal(found.targets(motion), without.targets(motion))
     assert arm(friction=0.1, parameters=softness).inverse_dynamics is None
+    both = {"both": Scale("joint elbow frictionloss", "joint elbow friction_softness")}
+    both |= {"hand": "body hand mass"}
+    assert arm(friction=0.1, parameters=both).inverse_dynamics is None
 
 
 @pytest.mark.parametrize(

@@ -89,12 +89,13 @@ def test_several_steps_per_sample_become_half_as_many():
     coarser = SIMULATOR.with_effects(friction).with_coarser_steps(time_step=0.1)
     assert coarser.effects == (friction,)
     assert (SIMULATOR.num_substeps(0.1), coarser.num_substeps(0.1)) == (5, 3)
-    assert coarser.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert SIMULATOR.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    own, half = (each.prepared(0.03, set()) for each in (SIMULATOR, coarser))
+    assert own.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    assert half.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert coarser.with_coarser_steps(time_step=0.1) is None
-    # Refined steps lead back to the file's own first.
+    # Refined steps lead back to the file's own only.
     again = SIMULATOR.with_finer_steps().with_coarser_steps(time_step=0.1)
-    assert again.num_substeps(0.1) == 5
+    assert again.num_substeps(0.1) == 5 and again.with_coarser_steps(time_step=0.1) is None
 
 
 def test_steps_of_order_four_lead_to_midpoint_steps_where_these_save_time(monkeypatch):

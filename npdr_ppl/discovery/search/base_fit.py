@@ -60,17 +60,10 @@ def fit_base(
     may_be_rough: bool = False,
     progress: Step | None = None,
 ) -> tuple[Hypothesis, Mapping[str, Tensor] | None]:
-    """Fits a model to a recording, without adding effects, and its initial states along that fit.
+    """Fits a model to a recording, without adding effects.
 
-    Args:
-        segments: The model along the recording.
-        near: See :func:`searched_fit`, as all others.
-        seed: Seed of the search.
-        may_be_rough: Whether a rough fit may be enough.
-        progress: Called with a short status.
-
-    Returns:
-        The fit, and if it is rough, parameters from which a fit in finer steps may begin.
+    Unless it is rough, the fit of :func:`searched_fit`, whose arguments and results these are, is
+    refined with initial states that are estimated along its own motion.
 
     Raises:
         DataError: No parameters can be simulated along the recording, or simulations fail close
@@ -100,14 +93,15 @@ def searched_fit(
 
     Args:
         segments: The model along the recording.
-        near: Parameters near which the fit is known to be; by default they are searched for.
+        near: Parameters near which the fit is expected; by default, and if they cannot be
+            simulated, they are searched for.
         seed: Seed of the search.
         may_be_rough: Whether a rough fit is enough if the model's steps are too coarse for a part
             of the recording already: its parameters would only compensate for the steps.
         progress: Called with a short status, and during the search with the fraction of it done.
 
     Returns:
-        As :func:`fit_base`.
+        The fit, and if it is rough, parameters from which a fit in finer steps may begin.
 
     Raises:
         DataError: No parameters can be simulated along the recording.
@@ -127,7 +121,7 @@ def searched_fit(
             failure = error
 
     begin(near or {})
-    if not near and not (begun and has_single_minimum(few, seed=seed)):
+    if not begun or not (near or has_single_minimum(few, seed=seed)):
         begin(_searched(segments, seed, progress))
     finer_parameters = None
     if may_be_rough and begun:

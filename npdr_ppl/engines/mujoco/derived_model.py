@@ -48,7 +48,10 @@ measured. Dry friction of four joints of the SO-101 is 2 to 8 times that of its 
 SOFTNESS_RANGE = (0.0001, 0.1)
 """95 % of the prior of the softness of dry friction, from the hardest that MuJoCo allows to its
 default. With the default, a stuck joint creeps: one of 0.03 kg m² that holds 0.15 N m moves 5 mrad
-in a second. Real joints hold."""
+in a second. Real joints hold, but recordings made with the default should be likely, too."""
+
+_DEFAULT_IMPEDANCE = 0.9
+"""First number of ``solimpfriction`` if a file does not set it."""
 
 ROTOR_RANGE = (0.0, 10.0)
 """Prior of an armature of a URDF file, which cannot state any, as factors on a typical value: the
@@ -100,7 +103,8 @@ class DerivedParameter:
         nominal: Its value in the file.
         low: Smallest value of a uniform prior, or the 2.5 % quantile of a log-normal one.
         high: Largest value of a uniform prior, or the 97.5 % quantile of a log-normal one.
-        family: Family of the prior.
+        family: Family of the prior. The median of a log-normal one is the geometric mean of its
+            quantiles.
     """
 
     name: str
@@ -172,12 +176,17 @@ class DerivedModel:
 def derive_model(source: str | PathLike[str]) -> DerivedModel:
     """Chooses the uncertain numbers of an MJCF file, or of a URDF file that MuJoCo compiles.
 
-    These are the masses of the bodies that joints move, with their inertias; damping, armature and
-    friction loss of joints, where the file has positive values; how far friction loss yields, one
-    number for all joints, if the file leaves it at the engine's default; and kp and kv of position
-    and velocity servos. Of a URDF file, which cannot state armatures, those of all joints are
-    varied, too. Priors of gains are log-normal about the file's values, that of the softness of
-    friction is log-normal, too, and the others are uniform, around the file's values or from zero.
+    These are
+
+    * the masses of the bodies that joints move, with their inertias,
+    * damping, armature and friction loss of joints, where the file has positive values; of a URDF
+      file, which cannot state armatures, those of all joints,
+    * how far friction loss yields, one number for all joints, if the file keeps the engine's
+      default,
+    * kp and kv of position and velocity servos.
+
+    Priors of gains are log-normal about the file's values, that of how far friction loss yields is
+    log-normal, too, and the others are uniform, around the file's values or from zero.
     What positions do not determine beside the others keeps the file's
     value; see
     :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
@@ -280,9 +289,10 @@ def _joints(model: Any, armature: tuple[float, float]) -> list[_Choice]:
 
 def _softness(model: Any, varied: set[str]) -> list[DerivedParameter]:
     """Returns how far dry friction yields, if some is varied and the file keeps the default."""
+    if not any(text.endswith(" frictionloss") for text in varied):
+        return []
     field = find_field(model, "joint * friction_softness")
-    is_default = {entry.nominal for entry in field.entries} == {_DEFAULT_IMPEDANCE}
-    if not is_default or not any(text.endswith(" frictionloss") for text in varied):
+    if {entry.nominal for entry in field.entries} != {_DEFAULT_IMPEDANCE}:
         return []
     low, high = SOFTNESS_RANGE
     nominal = 1.0 - _DEFAULT_IMPEDANCE
@@ -291,10 +301,6 @@ def _softness(model: Any, varied: set[str]) -> list[DerivedParameter]:
             "friction_softness", field.text, field.unit, nominal, low, high, "log-normal"
         )
     ]
-
-
-_DEFAULT_IMPEDANCE = 0.9
-"""First number of ``solimpfriction`` if a file does not set it."""
 
 
 def _servos(model: Any) -> list[_Choice]:

@@ -1,8 +1,8 @@
 """Readable names for the numbers of a MuJoCo model, e.g. ``"body hand mass"``.
 
 They have the form *element name quantity component*, as in ``"geom floor friction sliding"``. The
-name may be a pattern (``"geom * friction sliding"``). Options have no name (``"option gravity"``,
-the vector's magnitude).
+name may be a pattern (``"geom * friction sliding"``); ``"joint * friction_softness"`` means all
+joints with dry friction. Options have no name (``"option gravity"``, the vector's magnitude).
 """
 
 import importlib
@@ -225,6 +225,10 @@ def find_field(model: Any, text: str) -> Field:
         "mass_and_inertia": _solid_entries,
         "friction_softness": _softness_entries,
     }
+    if quantity == "friction_softness" and name not in names:
+        chosen = [i for i in chosen if model.dof_frictionloss[model.dof_jntid == i].any()]
+        if not chosen:
+            raise ModelError(f"{text!r}: no such joint has dry friction in the file.")
     if quantity in read:
         entries = [e for i in chosen for e in read[quantity](model, i, quantity, text)]
     else:

@@ -75,6 +75,8 @@ class MujocoMechanism(ClosedLoopSimulator):
     takes_compliance = True
     # The simulator without second joints, once effects have added some.
     rigid: Self | None = None
+    # Requested engine steps per engine step; see MujocoSimulator.with_coarser_steps.
+    coarsening = 1
 
     def __init__(
         self,
@@ -110,7 +112,6 @@ class MujocoMechanism(ClosedLoopSimulator):
         self.substeps, self.num_threads = substeps, num_threads
         # Engine steps per requested engine step; see MujocoSimulator.with_finer_steps.
         self.refinement = 1
-        self.coarsening = 1
         self.time_step = time_step or (substeps or 1) * float(self.model.opt.timestep)
         self._declare_channels(states, sensors, units or {}, bounds or {})
         taken = [channel.name for channel in (*self.states, *self.sensors, *self.actions)]
@@ -310,11 +311,13 @@ class MujocoMechanism(ClosedLoopSimulator):
             if isinstance(effect, ForceEffect) and effect.port == port.port.name
         }
         # If the file has dry friction, or a parameter sets it, the file's solver settings stay.
+        width = int(self.model.dof_solimp.shape[1])
         crisp = tuple(
             dof
             for dof in sorted(dofs)
             if self.model.dof_frictionloss[dof] == 0.0
             and ("dof_frictionloss", dof) not in assigned
+            and ("dof_solimp", dof * width) not in self.bindings.places
         )
         may_add = bool(crisp) or any(array.endswith("frictionloss") for array, _ in assigned)
         names = [action.name for action in self.actions]
@@ -323,11 +326,14 @@ class MujocoMechanism(ClosedLoopSimulator):
         unlimited = tuple(
             a for a in sorted(limits & changed) if not self.model.actuator_forcelimited[a]
         )
-        key = step, crisp, may_add, unlimited
+        key = step, crisp, may_add, unlimited, self.coarsening
         if key not in self.prepared_models:
-            self.prepared_models[key] = prepared_copy(
-                self.model, step, crisp, unlimited, keeps_solver=may_add
-            )
+            own = prepared_copy(self.model, step, crisp, unlimited, keeps_solver=may_add)
+            mujoco: Any = importlib.import_module("mujoco")
+            if self.coarsening > 1 and own.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+                # Longer explicit steps could make stiff servos unstable.
+                own.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+            self.prepared_models[key] = own
         return self.prepared_models[key]
 
     def _declare_channels(

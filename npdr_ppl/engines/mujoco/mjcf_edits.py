@@ -209,6 +209,10 @@ def _short(value: Any) -> str:
     return " ".join(f"{float(number):.6g}" for number in np.atleast_1d(value))
 
 
+_IMPEDANCES = 0.0001, 0.9999
+"""Least and greatest impedance; the engine replaces others by these."""
+
+
 def _of_dof(name: str) -> Callable[[Edits, int], None]:
     def write(edits: Edits, dof: int) -> None:
         def both(array: str) -> tuple[Any, Any]:
@@ -217,8 +221,10 @@ def _of_dof(name: str) -> Callable[[Edits, int], None]:
         higher = getattr(edits.model, f"dof_{name}poly", None)
         values = {name: _with_higher(*both(name), higher, dof)}
         if name == "frictionloss":
-            # As hard as in the package's simulations.
-            values |= {"solreffriction": both("solref"), "solimpfriction": both("solimp")}
+            # The solver's settings of dry friction are those of the package's simulations.
+            old, new = both("solimp")
+            new = np.array([np.clip(new[0], *_IMPEDANCES), *new[1:]])
+            values |= {"solreffriction": both("solref"), "solimpfriction": (old, new)}
         edits.attribute("joint", int(edits.model.dof_jntid[dof]), values)
 
     return write

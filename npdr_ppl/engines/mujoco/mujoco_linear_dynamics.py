@@ -66,6 +66,8 @@ def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None
     if not np.any(model.body_mass):
         return None
     held = bindings.names_setting({_SOFTNESS})
+    if held & bindings.names_setting(_LINEAR_ARRAYS):
+        return None
     determined = tuple(p for p in simulator.parameters if p.name not in held)
     nominal = np.array([parameter.nominal for parameter in determined])
     rest = {p.name: torch.tensor(p.nominal, dtype=torch.float64) for p in simulator.parameters}

@@ -159,8 +159,9 @@ def _hard_joints(simulator: MujocoMechanism, found: RandomisedFields) -> Sequenc
     """Returns the joints without dry friction in the file, on which dry friction acts."""
     model: Any = simulator.model
     ports = {port.port.name: port for port in simulator.force_ports}
-    set_by_parameters = {place for array, place in simulator.bindings.places
-                         if array == "dof_frictionloss"}  # fmt: skip
+    widths = {"dof_frictionloss": 1, "dof_solimp": int(model.dof_solimp.shape[1])}
+    set_by_parameters = {place // widths[array] for array, place in simulator.bindings.places
+                         if array in widths}  # fmt: skip
     result = []
     for effect in (*found.in_file, *found.beside):
         port = ports.get(effect.port)
