@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.recording_repair import _misfits, _relative
+from npdr_ppl.discovery.remedy_trials import misfits_of, relative_misfit
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from tests.helpers.pendulum_recordings import swinging
@@ -13,7 +13,7 @@ from tests.helpers.pendulum_recordings import swinging
 
 def misfits(rollouts):
     options = DataOptions(None, 30)
-    return _misfits(fit_hypothesis(pendulum, rollouts, options, max_steps=6, is_rough=True))
+    return misfits_of(fit_hypothesis(pendulum, rollouts, options, max_steps=6, is_rough=True))
 
 
 def test_a_channel_that_never_moves_is_not_explained_by_a_simulation_that_does():
@@ -51,6 +51,6 @@ def test_a_channel_that_moves_by_no_more_than_its_resolution_says_nothing():
 
 def test_channels_that_rest_are_not_explained_better():
     rests = {"angle": 0.0, "velocity": 2.0}
-    assert _relative({"angle": 0.0}, rests) == 1.0
-    assert _relative({"angle": 0.1}, rests) == float("inf")
-    assert _relative({"angle": 0.0, "velocity": 1.0}, rests) == 0.5
+    assert relative_misfit({"angle": 0.0}, rests) == 1.0
+    assert relative_misfit({"angle": 0.1}, rests) == float("inf")
+    assert relative_misfit({"angle": 0.0, "velocity": 1.0}, rests) == 0.5

@@ -8,7 +8,7 @@ import pyro.distributions as dist
 import pytest
 
 import npdr_ppl as npdr
-from npdr_ppl.discovery import recording_repair
+from npdr_ppl.discovery import recording_repair, remedy_trials
 from npdr_ppl.discovery.recording_repair import repair
 from npdr_ppl.discovery.remedies import (
     Remedy,
@@ -179,7 +179,7 @@ def test_commands_beyond_the_range_of_a_model_are_said():
 def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
     begun = {}
 
-    fit = recording_repair._Windows.fitted
+    fit = remedy_trials.Windows.fitted
 
     def fitted(self, model, rollouts, start=None):
         found = fit(self, model, rollouts, start)
@@ -188,11 +188,11 @@ def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
         return found
 
     kept = []
-    monkeypatch.setattr(recording_repair._Windows, "fitted", fitted)
+    monkeypatch.setattr(remedy_trials.Windows, "fitted", fitted)
     rollouts = swinging(steps=240)
-    windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 30))
+    windows = remedy_trials.Windows(rollouts, npdr.DataOptions(None, 30))
     as_read = windows.fitted(pendulum, rollouts)
-    trials = recording_repair._Trials(pendulum, rollouts, windows, as_read)
+    trials = remedy_trials.RemedyTrials(pendulum, rollouts, windows, as_read)
     for remedy in (Shift(None, 2).remedy, Shift(None, 4).remedy, Shift(None, 1).remedy):
         trials.ratio(remedy)
     inverted = next(r for r in remedies(Pendulum.sensors, rollouts) if "sign" in r.sentence)
@@ -240,7 +240,7 @@ def test_a_fit_begins_where_the_check_has_searched(monkeypatch):
 def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is(monkeypatch):
     """A fit that got stuck is no fault of the data."""
     rollouts, options = swinging(steps=240), npdr.DataOptions(None, 30)
-    fit = recording_repair._Windows.fitted
+    fit = remedy_trials.Windows.fitted
 
     def stuck(self, model, recording, start=None):
         found = fit(self, model, recording, start)
@@ -249,11 +249,11 @@ def test_no_remedy_is_needed_where_its_parameters_explain_the_recording_as_it_is
             return dataclasses.replace(found, fit=away)
         return found
 
-    monkeypatch.setattr(recording_repair._Windows, "fitted", stuck)
+    monkeypatch.setattr(remedy_trials.Windows, "fitted", stuck)
     monkeypatch.setattr(recording_repair, "_searched", lambda *_: None)
-    windows = recording_repair._Windows(rollouts, options)
+    windows = remedy_trials.Windows(rollouts, options)
     as_read = windows.fitted(pendulum, rollouts)
-    trials = recording_repair._Trials(pendulum, rollouts, windows, as_read)
+    trials = remedy_trials.RemedyTrials(pendulum, rollouts, windows, as_read)
     shift = Shift(None, 1).remedy
     assert trials.ratio(shift) < recording_repair.REPAIR.remedy_factor
     assert trials.ratio_without(shift) < trials.ratio(shift)
@@ -311,7 +311,7 @@ def test_a_remedy_that_leaves_much_must_beat_wider_priors(monkeypatch, wider, is
     def ratio(trials, remedy):
         return 0.4 if remedy.sentence.startswith("The sign of torque") else 1.0
 
-    trials = recording_repair._Trials
+    trials = remedy_trials.RemedyTrials
     monkeypatch.setattr(trials, "ratio", ratio)
     monkeypatch.setattr(trials, "ratio_without", lambda trials, remedy: 1.0)
     monkeypatch.setattr(trials, "ratio_with_wider_priors", lambda trials, as_read: wider)
@@ -322,9 +322,9 @@ def test_a_remedy_that_leaves_much_must_beat_wider_priors(monkeypatch, wider, is
 
 def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypatch):
     settings = dataclasses.replace(recording_repair.REPAIR, most_segments=5)
-    monkeypatch.setattr(recording_repair, "REPAIR", settings)
+    monkeypatch.setattr(remedy_trials, "REPAIR", settings)
     rollouts = turned(1.0, 1.0)
-    windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 20))
+    windows = remedy_trials.Windows(rollouts, npdr.DataOptions(None, 20))
     whole = windows.fitted(wheel, rollouts).segments.inputs
     moved = windows.fitted(wheel, Shift(None, -3)(rollouts)).segments.inputs
     assert len(whole.start) == 5 and whole.start.max() > 300
@@ -333,18 +333,18 @@ def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypa
 
 def test_only_hopeful_remedies_are_tried_along_all_segments(monkeypatch):
     settings = dataclasses.replace(recording_repair.REPAIR, most_segments=16, fewest_first=4)
-    monkeypatch.setattr(recording_repair, "REPAIR", settings)
+    monkeypatch.setattr(remedy_trials, "REPAIR", settings)
     rollouts = _ScaledAction("torque", -1.0)(turned(1.0, 1.0))
-    windows = recording_repair._Windows(rollouts, npdr.DataOptions(None, 20))
-    trials = recording_repair._Trials(wheel, rollouts, windows, windows.fitted(wheel, rollouts))
-    fit, sizes = recording_repair._Windows.fitted, []
+    windows = remedy_trials.Windows(rollouts, npdr.DataOptions(None, 20))
+    trials = remedy_trials.RemedyTrials(wheel, rollouts, windows, windows.fitted(wheel, rollouts))
+    fit, sizes = remedy_trials.Windows.fitted, []
 
     def counted(self, model, recording, start=None):
         found = fit(self, model, recording, start)
         sizes.append(found.segments.inputs.num_segments)
         return found
 
-    monkeypatch.setattr(recording_repair._Windows, "fitted", counted)
+    monkeypatch.setattr(remedy_trials.Windows, "fitted", counted)
     assert trials.ratio(Remedy("", _Scaled(["angle"], 57.3))) > settings.hopeless_ratio
     assert sizes == [4]
     assert trials.ratio(Remedy("", _ScaledAction("torque", -1.0))) < settings.remedy_factor
