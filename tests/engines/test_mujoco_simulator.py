@@ -609,8 +609,8 @@ def test_inverse_dynamics_do_not_contain_how_far_friction_yields():
     found = arm(friction=0.1, parameters=softness | friction).inverse_dynamics
     assert found is not None and without is not None
     assert found.determined == without.determined == ("friction", "hand")
-    torch.manual_seed(0)
-    columns = torch.randn(8, 20, dtype=torch.float64).unbind(0)
+    generator = torch.Generator().manual_seed(0)
+    columns = torch.randn(8, 20, generator=generator, dtype=torch.float64).unbind(0)
     motion = Motion(columns[:2], columns[2:4], columns[4:6], columns[6:])
     assert torch.equal(found.regressors(motion), without.regressors(motion))
     assert torch.equal(found.targets(motion), without.targets(motion))

@@ -185,10 +185,9 @@ def derive_model(source: str | PathLike[str]) -> DerivedModel:
       default,
     * kp and kv of position and velocity servos.
 
-    Priors of gains are log-normal about the file's values, that of how far friction loss yields is
-    log-normal, too, and the others are uniform, around the file's values or from zero.
-    What positions do not determine beside the others keeps the file's
-    value; see
+    Priors of gains are log-normal about the file's values, and that of how far friction loss
+    yields is log-normal in ``SOFTNESS_RANGE``. The others are uniform, around the file's values or
+    from zero. What positions do not determine beside the others keeps the file's value; see
     :func:`~npdr_ppl.engines.mujoco.dependent_fields.dependent_fields`.
 
     Args:
