@@ -135,7 +135,10 @@ def test_the_python_simulates_as_an_edited_file_does(arm):
         compiled.body(body).mass[:] *= factor
         compiled.body(body).inertia[:] *= factor
     compiled.joint("elbow").frictionloss[:] = float(values["elbow_frictionloss"])
-    compiled.dof_solimp[:, 0] = 1.0 - float(values["friction_softness"])
+    softness = float(values["friction_softness"])
+    least = 2.0 * compiled.opt.timestep
+    compiled.dof_solimp[:, 0] = 1.0 - softness
+    compiled.dof_solref[:, 0] = least + (0.02 - least) * softness / 0.1
     compiled.joint("shoulder").armature[:] = float(values["shoulder_armature"])
     kp, kv = float(values["shoulder_servo_kp"]), float(values["shoulder_servo_kv"])
     compiled.actuator_gainprm[0, 0] = kp
@@ -266,7 +269,8 @@ def test_the_softness_of_friction_is_that_of_joints_with_friction(tmp_path):
     robot = loaded(derive_model(path).source(path))["robot"]
     assert {place for array, place in robot.bindings.places if array == "dof_solimp"} == {30}
     exported = export_mjcf(robot, {"friction_softness": torch.tensor(0.001)})
-    assert exported.text.count("solimpfriction") == 2  # the attribute and the comment
+    for attribute in ("solimpfriction", "solreffriction"):
+        assert exported.text.count(attribute) == 2  # the attribute and the comment
 
 
 def test_friction_whose_hardness_the_file_sets_keeps_it(arm):

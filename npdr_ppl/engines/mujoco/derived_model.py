@@ -50,8 +50,8 @@ SOFTNESS_RANGE = (0.0001, 0.1)
 default. With the default, a stuck joint creeps: one of 0.03 kg m² that holds 0.15 N m moves 5 mrad
 in a second. Real joints hold, but recordings made with the default should be likely, too."""
 
-_DEFAULT_IMPEDANCE = 0.9
-"""First number of ``solimpfriction`` if a file does not set it."""
+DEFAULT_SOFTNESS = 0.1
+"""Softness of dry friction if a file sets no ``solimpfriction``."""
 
 ROTOR_RANGE = (0.0, 10.0)
 """Prior of an armature of a URDF file, which cannot state any, as factors on a typical value: the
@@ -291,13 +291,12 @@ def _softness(model: Any, varied: set[str]) -> list[DerivedParameter]:
     if not any(text.endswith(" frictionloss") for text in varied):
         return []
     field = find_field(model, "joint * friction_softness")
-    if {entry.nominal for entry in field.entries} != {_DEFAULT_IMPEDANCE}:
+    if field.nominal is None or not math.isclose(field.nominal, DEFAULT_SOFTNESS):
         return []
     low, high = SOFTNESS_RANGE
-    nominal = 1.0 - _DEFAULT_IMPEDANCE
     return [
         DerivedParameter(
-            "friction_softness", field.text, field.unit, nominal, low, high, "log-normal"
+            "friction_softness", field.text, field.unit, DEFAULT_SOFTNESS, low, high, "log-normal"
         )
     ]
 

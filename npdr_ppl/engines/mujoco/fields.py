@@ -99,7 +99,7 @@ _QUANTITIES: dict[str, dict[str, _Quantity]] = {
     "joint": {
         "damping": _Quantity("dof_damping", "{force} s/{position}"),
         "frictionloss": _Quantity("dof_frictionloss", "{force}"),
-        # One minus the impedance; see :func:`_softness_entries`.
+        # Impedance and time constant; see :func:`_softness_entries`.
         "friction_softness": _Quantity("dof_solimp", "1"),
         "armature": _Quantity("dof_armature", "{inertia}"),
         "stiffness": _Quantity("jnt_stiffness", "{force}/{position}"),
@@ -305,14 +305,22 @@ def _softness_entries(model: Any, joint: int, quantity: str, text: str) -> list[
 
     The engine's friction holds a joint only nearly: under a force f below the friction loss, the
     joint creeps at about T f (1 − d) / (2 d m), where d is the first number of ``solimpfriction``,
-    T that of ``solreffriction`` and m the joint's inertia. The softness is 1 − d. The engine
-    allows 0.0001 to 0.9999.
+    T that of ``solreffriction`` and m the joint's inertia. A joint that stops is slowed during T.
+    The softness is 1 − d, and T decreases linearly with it, to two of the file's steps at zero.
+    The engine allows impedances of 0.0001 to 0.9999 and time constants of at least two steps.
     """
-    info = _QUANTITIES["joint"][quantity]
-    return [
-        entry._replace(factor=-1.0, offset=1.0)
-        for entry in _entries(model, "joint", joint, info, "")
-    ]
+    impedances, times = (
+        _entries(model, "joint", joint, info, "")
+        for info in (_QUANTITIES["joint"][quantity], _Quantity("dof_solref", "s"))
+    )
+    found = [entry._replace(factor=-1.0, offset=1.0) for entry in impedances]
+    least = 2.0 * float(model.opt.timestep)
+    for time, impedance in zip(times, impedances, strict=True):
+        softness = 1.0 - impedance.nominal
+        if softness > 0.0 and time.nominal > least:  # a negative number is a stiffness
+            factor = (time.nominal - least) / softness
+            found.append(time._replace(factor=factor, offset=least))
+    return found
 
 
 def _split(kind: str, rest: list[str], text: str) -> tuple[str, str, str]:

@@ -280,6 +280,7 @@ _WRITERS: dict[str, Callable[[Edits, int], None]] = {
     "dof_damping": _of_dof("damping"),
     "dof_frictionloss": _dry_friction,
     "dof_solimp": _dry_friction,
+    "dof_solref": _dry_friction,
     "dof_armature": _of_dof("armature"),
     "jnt_stiffness": _stiffness,
     "jnt_pos": _of("joint", "jnt_pos", "pos"),

@@ -42,7 +42,7 @@ _LINEAR_ARRAYS = {
     "body_ipos",
 }
 
-_SOFTNESS = "dof_solimp"
+_SOFTNESS = {"dof_solimp", "dof_solref"}
 """How far dry friction yields, which the equations of motion do not contain: in them it holds."""
 
 
@@ -61,11 +61,11 @@ def bound_inverse_dynamics(simulator: MujocoMechanism) -> InverseDynamics | None
     arrays = bindings.arrays
     if not (is_simple and is_whole and arrays & _LINEAR_ARRAYS):
         return None
-    if not arrays <= _LINEAR_ARRAYS | {_SOFTNESS}:
+    if not arrays <= _LINEAR_ARRAYS | _SOFTNESS:
         return None
     if not np.any(model.body_mass):
         return None
-    held = bindings.names_setting({_SOFTNESS})
+    held = bindings.names_setting(_SOFTNESS)
     if held & bindings.names_setting(_LINEAR_ARRAYS):
         return None
     determined = tuple(p for p in simulator.parameters if p.name not in held)
