@@ -7,7 +7,7 @@ replaced by draws of the posterior itself, whose first proposals are q and the c
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -133,7 +133,12 @@ class Correction:
 
 
 def check_estimator(
-    densities: Sequence[Density], likelihood: SegmentLikelihood, *, seed: int, corrects: bool
+    densities: Sequence[Density],
+    likelihood: SegmentLikelihood,
+    *,
+    seed: int,
+    corrects: bool,
+    report: Callable[[str], None] = lambda _: None,
 ) -> tuple[EstimatorCheck, Correction | None]:
     """Compares a learnt posterior with the simulator, and corrects it where they differ.
 
@@ -142,6 +147,7 @@ def check_estimator(
         likelihood: The recording's likelihood.
         seed: Seed of the draws.
         corrects: Whether to correct it.
+        report: Called with a short status while it is corrected.
 
     Returns:
         The comparison, and the corrected posterior; ``None`` if the learnt one is kept.
@@ -162,7 +168,7 @@ def check_estimator(
         agrees = is_covered and share >= ESTIMATOR_CHECK.agreeing_share
         return EstimatorCheck(k, share, False, k, share * len(z), agrees), None
     with torch.no_grad():
-        draws = sample_posterior(likelihood, [learnt], seed=seed)
+        draws = sample_posterior(likelihood, [learnt], seed=seed, report=report)
     check = EstimatorCheck(k, share, True, draws.k_hat, draws.effective, draws.is_reliable)
     return check, _corrected(draws, seed)
 

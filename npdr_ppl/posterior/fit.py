@@ -1,5 +1,6 @@
 """`npdr fit` as a function: infer, evaluate, diagnose, draw, and write it all down."""
 
+import shutil
 import time
 from collections import Counter
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.engines.workers import collect_faults
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
@@ -55,7 +57,8 @@ def fit(
         train: Rollouts to fit.
         test: Held-out rollouts to report on; the fitted ones if ``None``.
         out: Folder for ``posterior.nc``, ``fit.json`` and the run itself, from which an
-            interrupted fit continues; nothing is written if ``None``.
+            interrupted fit continues; its search for the closest parameters is in ``fits`` until
+            it has ended. Nothing is written if ``None``.
         backend: The inference backend.
         rounds: Rounds of simulating and training.
         extra_rounds: Rounds that the diagnosis may add where the estimator has not converged.
@@ -68,8 +71,9 @@ def fit(
     Returns:
         The posterior and the content of ``fit.json``.
     """
+    fits = None if out is None else out / "fits"
     with reporter(progress) as report:
-        with collect_faults() as before:
+        with collect_faults() as before, keep_fits(fits):
             prepared = prepare(
                 model,
                 train,
@@ -151,6 +155,8 @@ def fit(
         out.mkdir(parents=True, exist_ok=True)
         to_netcdf(data, out / "posterior.nc")
         write_json(out / "fit.json", result)
+    if fits is not None:
+        shutil.rmtree(fits, ignore_errors=True)
     return posterior, result
 
 

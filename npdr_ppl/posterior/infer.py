@@ -157,9 +157,14 @@ def infer(
         learnt = Posterior(bound, method, problem, states[1:], provenance, preparation=preparation)
         if bound.likelihood is None:
             return learnt
-        report.stage("compare with the simulator")(None, "")
+        step = report.stage("compare with the simulator")
+        step(None, "")
         estimator, correction = check_estimator(
-            learnt.densities, bound.likelihood, seed=seed, corrects=corrects
+            learnt.densities,
+            bound.likelihood,
+            seed=seed,
+            corrects=corrects,
+            report=lambda status: step(None, status),
         )
         posterior = learnt.corrected(estimator, correction)
         if store is not None:

@@ -12,7 +12,7 @@ so that few moves suffice; see :mod:`npdr_ppl.preparation.density_surrogate`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -130,6 +130,7 @@ def sample_posterior(
     seed: int,
     is_rough: bool = False,
     most_iterations: int | None = None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> WeightedDraws:
     """Draws from the posterior of a recording by adaptive importance sampling.
 
@@ -143,6 +144,7 @@ def sample_posterior(
         seed: Seed of the draws.
         is_rough: Whether ridges are taken as straight, and draws do not move on to their ends.
         most_iterations: Greatest number of proposals; that of the settings by default.
+        report: Called with a short status after each proposal.
     """
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=is_rough)
@@ -174,7 +176,10 @@ def sample_posterior(
         smoothed, k_hat = smoothed_weights(log_weights)
         size = effective_size(smoothed)
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
+        report(f"{len(z)} draws, {size:.0f} of {settings.enough_effective:.0f} effective ones")
         if result.k_hat <= settings.reliable_k and result.effective >= settings.enough_effective:
+            break
+        if iteration + 1 >= settings.iterations_to_adapt and size < z.shape[1]:
             break
         adapted = _adapted(w, log_weights, seed, iteration)
         own.append(_Proposal(adapted, settings.draws_per_iteration, space))

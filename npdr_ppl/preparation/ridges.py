@@ -38,7 +38,7 @@ class RidgeCoordinates:
 
     Attributes:
         space: The coordinates y from which w are computed.
-        centre: The closest fit in them, ``(d,)``.
+        centre: The most likely point near the closest fit in them, ``(d,)``.
         basis: Columns map w − shear to y − centre, ``(d, d)``.
         information: Information of the recording in units of the prior's, ``(d,)``; ascending
             among the weak coordinates and among the others.
@@ -69,17 +69,20 @@ class RidgeCoordinates:
             seed: Seed of the points of a ridge.
             is_rough: Whether ridges are taken as straight, which needs no simulations.
         """
-        space, z = SamplingCoordinates.of(likelihood.segments.prior), likelihood.fit.z
+        z, known = likelihood.fit.z, likelihood.information()
+        # Even with all others known, the recording says less about these than the prior.
+        space = SamplingCoordinates.of(likelihood.segments.prior, known.diagonal() < 1.0)
         slope = space.slope(z).clamp_min(1e-12)
         spread = space.variance.sqrt()
-        scaled = likelihood.information() * (spread / slope)[:, None] * (spread / slope)
+        scaled = known * (spread / slope)[:, None] * (spread / slope)
         information, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
         information = information.clamp_min(0.0)
         # Along a direction of width δ the ridge departs from a line by about δ², in units of the
         # prior. The direction can be weak if that exceeds the width of the stiffest one.
         can_be_weak = 0 if is_rough else int((information**2 < information[-1]).sum())
         basis = spread[:, None] * vectors
-        straight = cls._straight(space, space.from_reference(z[None])[0], basis, information, 0)
+        centre = space.from_reference(_most_likely(likelihood)[None])[0]
+        straight = cls._straight(space, centre, basis, information, 0)
         is_weak = torch.zeros(len(z), dtype=torch.bool)
         is_weak[:can_be_weak] = True
         if 0 < can_be_weak < len(z):
@@ -166,6 +169,7 @@ class RidgeCoordinates:
     def tensors(self) -> dict[str, Tensor]:
         """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""
         return {
+            "is_reference": self.space.is_reference,
             "centre": self.centre,
             "basis": self.basis,
             "information": self.information,
@@ -180,7 +184,7 @@ class RidgeCoordinates:
         """Rebuilds coordinates of a prior from :meth:`tensors`."""
         num_weak, degree = tensors["shape"].tolist()
         return cls(
-            SamplingCoordinates.of(prior),
+            SamplingCoordinates.of(prior, tensors["is_reference"]),
             tensors["centre"],
             tensors["basis"],
             tensors["information"],
@@ -322,3 +326,32 @@ class RidgeCoordinates:
             points_per_coefficient=RIDGE.points_per_coefficient,
         )
         return self if bend is None else replace(self, bend=bend)
+
+
+def _most_likely(likelihood: SegmentLikelihood) -> Tensor:
+    """Returns the most likely point near the closest fit, ``(d,)``.
+
+    The fit counts all measurements, as if they were independent. With their effective number, the
+    prior weighs more, and parameters about which the recording says little are nearer to its
+    middle. Newton steps with the derivatives of the fit lead there.
+
+    Args:
+        likelihood: The recording's likelihood.
+    """
+    z, prior = likelihood.fit.z, likelihood.segments.prior
+    eye = torch.eye(len(z), dtype=torch.float64)
+    factors = torch.tensor(RIDGE.centre_steps, dtype=torch.float64)[:, None]
+    tried, best = z[None], -torch.inf
+    for _ in range(RIDGE.most_centre_steps):
+        scores, misfits = likelihood.scores(tried)
+        density = (prior.log_prob(tried).double() - 0.5 * misfits).nan_to_num(-torch.inf)
+        chosen = int(density.argmax())
+        gain = float(density[chosen]) - best
+        if not gain > 0.0:
+            break
+        z, best = tried[chosen], float(density[chosen])
+        if gain < RIDGE.centre_gain:
+            break
+        change = torch.linalg.solve(likelihood.information() + eye, scores[chosen] - z)
+        tried = z + factors * change.nan_to_num(0.0)
+    return z

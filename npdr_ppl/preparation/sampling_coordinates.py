@@ -2,11 +2,13 @@
 
 A motion determines products and ratios of masses, lengths and gains. If several parameters occur
 only in one product, the posterior is a ridge. The ridge is curved in the prior's reference
-coordinates and straight in the parameters' logarithms.
+coordinates and straight in the parameters' logarithms. Parameters about which a recording says
+little are as the prior says, which is normal in its reference coordinates only.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -19,28 +21,39 @@ __all__ = ["SamplingCoordinates"]
 
 @dataclass(frozen=True)
 class SamplingCoordinates:
-    """Coordinates y of a prior: each parameter, or its logarithm if it cannot be close to zero.
+    """Coordinates y of a prior: each parameter, its logarithm, or its reference coordinate.
 
     Priors whose sites are not independent scalars keep their reference coordinates.
 
     Attributes:
         prior: The prior.
-        is_elementwise: Whether y is the parameters or their logarithms.
-        is_logarithm: Which of them are logarithms, ``(d,)``.
+        is_elementwise: Whether y is made of the parameters one by one.
+        is_logarithm: Which coordinates are logarithms of parameters, ``(d,)``.
+        is_reference: Which of them are reference coordinates, ``(d,)``.
         variance: Variance of y under the prior, ``(d,)``.
     """
 
     prior: Prior
     is_elementwise: bool
     is_logarithm: Tensor
+    is_reference: Tensor
     variance: Tensor
 
     @classmethod
-    def of(cls, prior: Prior) -> "SamplingCoordinates":
-        """Chooses the coordinates of a prior."""
+    def of(cls, prior: Prior, undetermined: Tensor | None = None) -> "SamplingCoordinates":
+        """Chooses the coordinates of a prior.
+
+        Logarithms are taken of parameters that cannot be close to zero, or whose logarithms are
+        normal.
+
+        Args:
+            prior: The prior.
+            undetermined: Mask of parameters that keep their reference coordinates, because a
+                recording says little about them, ``(d,)``; none by default.
+        """
         d = prior.num_parameters
-        none = torch.zeros(d, dtype=torch.bool)
-        rest = cls(prior, False, none, torch.ones(d, dtype=torch.float64))
+        none, ones = torch.zeros(d, dtype=torch.bool), torch.ones(d, dtype=torch.float64)
+        rest = cls(prior, False, none, ~none, ones)
         if any(site.shape.numel() != 1 for site in prior.sites):
             return rest
         ends = torch.stack(
@@ -49,7 +62,7 @@ class SamplingCoordinates:
                 for sign in (-1.0, 0.0, 1.0)
             ]
         ).double()
-        low, _, high = _columns(prior, ends)
+        low, middle, high = _columns(prior, ends)
         generator = torch.Generator().manual_seed(0)
         z = torch.randn(
             SAMPLING_COORDINATES.num_prior_draws, d, generator=generator, dtype=torch.float64
@@ -60,17 +73,21 @@ class SamplingCoordinates:
         ).double()
         if not torch.allclose(_columns(prior, alone).diagonal(), high):
             return rest
-        is_logarithm = (low > 0.0) & (high < SAMPLING_COORDINATES.widest_ratio * low)
-        raw = cls(prior, True, is_logarithm, torch.ones(d, dtype=torch.float64))
-        variance = raw.from_reference(z).var(0)
-        return cls(prior, True, is_logarithm, variance)
+        is_far_from_zero = high < SAMPLING_COORDINATES.widest_ratio * low
+        is_log_normal = torch.isclose(low * high, middle.square(), rtol=1e-6, atol=0.0)
+        is_reference = none if undetermined is None else undetermined
+        is_logarithm = (low > 0.0) & (is_far_from_zero | is_log_normal) & ~is_reference
+        raw = cls(prior, True, is_logarithm, is_reference, ones)
+        return cls(prior, True, is_logarithm, is_reference, raw.from_reference(z).var(0))
 
     def from_reference(self, z: Tensor) -> Tensor:
         """Maps reference coordinates ``(n, d)`` to y."""
+        z = z.double()
         if not self.is_elementwise:
-            return z.double()
-        values = _columns(self.prior, z.double())
-        return torch.where(self.is_logarithm, values.clamp_min(1e-300).log(), values)
+            return z
+        values = _columns(self.prior, z)
+        y = torch.where(self.is_logarithm, values.clamp_min(1e-300).log(), values)
+        return torch.where(self.is_reference, z, y)
 
     def to_reference(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Maps y ``(n, d)`` to reference coordinates; also returns which lie on the support.
@@ -80,6 +97,9 @@ class SamplingCoordinates:
         if not self.is_elementwise:
             return y, torch.ones(len(y), dtype=torch.bool)
         values = torch.where(self.is_logarithm, y.exp(), y)
+        if bool(self.is_reference.any()):
+            own = _columns(self.prior, torch.where(self.is_reference, y, 0.0))
+            values = torch.where(self.is_reference, own, values)
         parameters = {
             site.name: values[:, k].reshape((-1, *site.shape))
             for k, site in enumerate(self.prior.sites)
@@ -88,14 +108,24 @@ class SamplingCoordinates:
         kept = {name: value[inside] for name, value in parameters.items()}
         z = torch.zeros_like(y)
         if bool(inside.any()):
-            z[inside] = self.prior.to_reference(kept).double()
+            found = self.prior.to_reference(kept).double()
+            z[inside] = torch.where(self.is_reference, y[inside], found)
         return z, inside
 
     def log_jacobian(self, z: Tensor, y: Tensor) -> Tensor:
         """Returns log |∂y/∂z|, ``(n,)``."""
         if not self.is_elementwise:
             return torch.zeros(len(z), dtype=torch.float64)
-        return self.prior.log_jacobian(z).double() - (y * self.is_logarithm).sum(-1)
+        rest = torch.where(self.is_reference, 0.0, z.double())
+        of_values = self.prior.log_jacobian(rest).double() - self._left_out
+        return of_values - (y * self.is_logarithm).sum(-1)
+
+    @cached_property
+    def _left_out(self) -> Tensor:
+        """Σ log |∂θ/∂z| of the parameters with reference coordinates, where these are zero."""
+        plain = replace(self, is_reference=torch.zeros_like(self.is_reference))
+        slope = plain.slope(torch.zeros(len(self.variance), dtype=torch.float64))
+        return slope[self.is_reference].log().sum()
 
     def slope(self, z: Tensor) -> Tensor:
         """Returns ∂y/∂z of each coordinate at one point ``(d,)``, shape ``(d,)``."""

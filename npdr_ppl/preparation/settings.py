@@ -248,6 +248,10 @@ class RidgeSettings:
             of the posterior. It would raise the log density by half its square.
         fitted_share: Share of the points to which the polynomial is fitted, those closest to the
             recording. Chord steps need not converge everywhere.
+        centre_steps: Parts of a Newton step from the closest fit to the most likely point that are
+            tried; each costs one simulation of the recording.
+        most_centre_steps: Greatest number of these steps.
+        centre_gain: Gain in log density below which they end.
     """
 
     fewest_points: int = 96
@@ -268,6 +272,9 @@ class RidgeSettings:
     longest_step: float = 1.0
     shortest_step: float = 0.1
     fitted_share: float = 0.75
+    centre_steps: tuple[float, ...] = (1.0, 0.5, 0.25)
+    most_centre_steps: int = 8
+    centre_gain: float = 0.1
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
@@ -279,6 +286,9 @@ class RidgeSettings:
         check_range(self, 0.0, 100.0, "straight_gain", "close_gain", "reach")
         check_range(self, 0.0, 100.0, "longest_step", "shortest_step")
         check_range(self, 1.0, 100.0, "growth")
+        check_range(self, 0.0, 1.0, "centre_steps")
+        check_range(self, 1, 100, "most_centre_steps")
+        check_range(self, 0.0, 10.0, "centre_gain")
 
 
 @dataclass(frozen=True)
@@ -289,6 +299,8 @@ class ImportanceSamplingSettings:
         draws_per_iteration: Number of draws in each iteration; each is one simulation of the
             recording.
         most_iterations: Greatest number of iterations.
+        iterations_to_adapt: Number of iterations after which sampling ends if fewer draws are
+            effective than there are parameters. Further proposals then hardly come nearer.
         reliable_k: Greatest Pareto shape k̂ of the weights with which estimates are reliable
             (Vehtari et al. 2024).
         enough_effective: Effective sample size at which sampling ends. The ends of a 90 % interval
@@ -311,6 +323,7 @@ class ImportanceSamplingSettings:
 
     draws_per_iteration: int = 512
     most_iterations: int = 16
+    iterations_to_adapt: int = 8
     reliable_k: float = 0.7
     enough_effective: float = 200.0
     num_walkers: int = 256
@@ -326,6 +339,7 @@ class ImportanceSamplingSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
+        check_range(self, 1, math.inf, "iterations_to_adapt")
         check_range(self, 1, math.inf, "sweeps", "sweeps_alone", "sweeps_between_draws")
         check_range(self, 4, math.inf, "num_walkers")
         check_range(self, 1, math.inf, "enough_effective", "least_effective", "draws_of_given")

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from npdr_ppl.preparation.segment_fit import fit_segments
 from npdr_ppl.rollouts import Rollouts
 from tests.helpers.command_line import assert_prints_sentence, run
 
@@ -178,6 +179,30 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         results.append(json.loads((out / "fit.json").read_text()))
     assert results[0]["parameters"] == results[1]["parameters"]
     assert results[0]["metrics"] == results[1]["metrics"]
+    assert not (killed / "fits").exists()
+
+
+def test_an_interrupted_fit_has_kept_its_closest_parameters(
+    monkeypatch, capsys, tmp_path, recording
+):
+    made = []
+    words = ["fit", "pendulum", "--data", recording, "--quiet", "--out", tmp_path / "fit"]
+
+    def counted(*args, **options):
+        made.append(1)
+        return fit_segments(*args, **options)
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("npdr_ppl.discovery.hypothesis.fit_segments", counted)
+    monkeypatch.setattr("npdr_ppl.posterior.fit.infer", interrupted)
+    numbers = []
+    for _ in range(2):
+        code, _, err = run(monkeypatch, capsys, *words)
+        assert code == 130 and "continues the run" in err
+        numbers.append(len(made))
+    assert numbers[0] == numbers[1] > 0
 
 
 @pytest.mark.parametrize(

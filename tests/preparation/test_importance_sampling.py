@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pyro
+import pyro.distributions as dist
 import pytest
 import torch
 
@@ -15,6 +17,7 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.importance_sampling import sample_posterior
 from npdr_ppl.preparation.polynomials import Polynomial
 from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
 from tests.helpers.pendulum_recordings import product, swinging
 
 TAIL = 1e-5
@@ -75,6 +78,40 @@ def test_a_ridge_is_followed_to_the_ends_of_the_prior(ridge):
     likely = density[found.weights > found.weights.max() * 1e-3]
     assert float(likely.min()) < 0.65
     assert float(likely.max()) > 1.8
+
+
+def many_idle(inputs):
+    """A pendulum with parameters that do nothing, some with wide priors."""
+    for number in range(8):
+        pyro.sample(f"uniform_{number}", dist.Uniform(0.0, 1.0))
+        pyro.sample(f"gain_{number}", dist.LogNormal(0.0, 2.0))
+    return pendulum(inputs)
+
+
+def test_parameters_that_do_nothing_cost_no_draws():
+    prepared = prepare(many_idle, swinging(rollouts=1, steps=200), DataOptions())
+    fit = prepared.likelihood.fit
+    # A fit may end anywhere along them, as here at 1.5 standard deviations of the prior.
+    away = torch.where(fit.z.abs() < 1e-3, 1.5, fit.z)
+    likelihood = replace(prepared.likelihood, fit=replace(fit, z=away))
+    found = sample_posterior(likelihood, seed=0)
+    idle = RidgeCoordinates.of(likelihood, seed=0).space.is_reference
+    assert int(idle.sum()) == 16 and found.is_reliable
+    # The heavy tails of the first proposal leave half of the 512 draws at best.
+    assert found.iterations == 1 and found.effective > 200
+    mean, covariance = found.moments()
+    assert float(mean[idle].abs().max()) < 0.3
+    assert float((covariance.diagonal()[idle].sqrt() - 1.0).abs().max()) < 0.3
+
+
+def test_a_log_normal_parameter_is_sampled_by_its_logarithm():
+    prepared = prepare(many_idle, swinging(rollouts=1, steps=200), DataOptions())
+    prior = prepared.likelihood.segments.prior
+    space = SamplingCoordinates.of(prior)
+    names = [site.name for site in prior.sites]
+    logs = {name for name, is_log in zip(names, space.is_logarithm, strict=True) if is_log}
+    assert {name for name in names if name.startswith("gain")} <= logs
+    assert not any(name.startswith("uniform") for name in logs)
 
 
 def test_of_many_weak_coordinates_the_most_curved_are_traced(ridge):
