@@ -154,8 +154,9 @@ def estimate_starts(
         dtype=inputs.actions.dtype,
     )
     places = inputs.start - around.start
-    predicted = _predicted(box.simulator, box.parameters, around)
-    rates = _predicted_rates(box, around, predicted, places)
+    simulated = _simulated(box.simulator, box.parameters, around)
+    predicted = _predicted(box.simulator, simulated, around)
+    rates = _predicted_rates(box, around, simulated, predicted, places)
     row = torch.arange(len(places))
     reported = {sensor.name for sensor in box.simulator.sensors}
     is_reported = torch.tensor([name in reported for name in around.channel_names])
@@ -190,15 +191,18 @@ def _first_usable(rollouts: Rollouts, rollout: int, step: int) -> int:
     return next(first for first, end in rollouts.spans[rollout] if first <= step < end)
 
 
-def _predicted(simulator: Simulator, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
+def _simulated(simulator: Simulator, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
+    """Returns all of a simulator's readings after each step, ``(S, K, sensors)``."""
+    readings = simulator.simulate(parameters, inputs)
+    return readings.reshape(inputs.num_segments, inputs.num_steps, len(simulator.sensors))
+
+
+def _predicted(simulator: Simulator, simulated: Tensor, inputs: Inputs) -> Tensor:
     """Returns the recorded channels from each segment's start on, ``(S, K + 1, channels)``.
 
     Channels that the simulator does not have are zero.
     """
     names = [sensor.name for sensor in simulator.sensors]
-    simulated = simulator.simulate(parameters, inputs).reshape(
-        inputs.num_segments, inputs.num_steps, len(names)
-    )
     result = torch.zeros(inputs.num_segments, inputs.num_steps + 1, len(inputs.channel_names)).to(
         simulated
     )
@@ -210,12 +214,13 @@ def _predicted(simulator: Simulator, parameters: Mapping[str, Tensor], inputs: I
 
 
 def _predicted_rates(
-    box: SimulatorBlackBox, inputs: Inputs, predicted: Tensor, places: Tensor
+    box: SimulatorBlackBox, inputs: Inputs, simulated: Tensor, predicted: Tensor, places: Tensor
 ) -> Tensor:
     """Returns the rates of the recorded channels at one step of each segment, ``(S, channels)``.
 
-    It is the simulated velocity, if there is one and nothing else changes the position;
-    otherwise the central difference of the simulated measurements.
+    It is the simulated velocity, recorded or not, if there is one and nothing else changes the
+    position; otherwise the central difference of the simulated measurements, which is wrong where
+    a command jumps.
     """
     simulator = box.simulator
     row = torch.arange(len(places))
@@ -228,20 +233,24 @@ def _predicted_rates(
     ports = [simulator.port(effect.port) for effect in effects]
     if any(port.kind == "clock" for port in ports):
         return rates
-    true = predicted
     if effects:
         plain = copy.copy(simulator)
         plain.effects = tuple(e for e in simulator.effects if not isinstance(e, SensorEffect))
         own = {name for effect in effects for name in effect.parameter_names}
         rest = {name: value for name, value in box.parameters.items() if name not in own}
-        true = _predicted(plain, rest, inputs)
+        simulated = _simulated(plain, rest, inputs)
     changed = {name for port in ports for name in port.channels}
-    reported = {sensor.name for sensor in simulator.sensors}
+    reported = [sensor.name for sensor in simulator.sensors]
     columns = {name: i for i, name in enumerate(inputs.channel_names)}
-    for state in simulator.states:
-        if state.rate_of in columns and state.rate_of not in changed:
-            if state.name in columns and state.name in reported:
-                rates[:, columns[state.rate_of]] = true[row, places, columns[state.name]]
+    known = {
+        columns[state.rate_of]: reported.index(state.name)
+        for state in simulator.states
+        if state.rate_of in columns and state.rate_of not in changed and state.name in reported
+    }
+    # The first state is not simulated, and not needed.
+    there = simulated[row, (places - 1).clamp_min(0)]
+    for column, sensor in known.items():
+        rates[:, column] = there[:, sensor]
     return rates
 
 
