@@ -54,6 +54,34 @@ def swinging(*, rollouts=3, steps=250, friction=0.0, noise=NOISE, seed=0):
     )
 
 
+def jerked(*, steps=800, every=20, seed=0):
+    """Returns a rollout of angles under a torque that jumps, and the true velocities.
+
+    Args:
+        steps: Number of steps.
+        every: Steps between jumps.
+        seed: Seed of the torques and the noise.
+    """
+    generator = np.random.default_rng(seed)
+    torque = generator.uniform(-0.8, 0.8, -(-steps // every)).repeat(every)[:steps]
+    states = [np.zeros(2)]
+    for command in torque:
+        state = states[-1]
+        for _ in range(SUBSTEPS):
+            state = _step(state, command, 0.0, TIME_STEP / SUBSTEPS)
+        states.append(state)
+    angles, velocities = np.array(states).T
+    noisy = angles + 1e-4 * generator.standard_normal(steps + 1)
+    rollouts = Rollouts.from_arrays(
+        readings=[noisy[:, None]],
+        actions=[torque[:, None]],
+        channel_names=("angle",),
+        action_names=("torque",),
+        time_step=TIME_STEP,
+    )
+    return rollouts, velocities
+
+
 def product(inputs):
     """A pendulum of whose mass a recording shows only the product of density and volume."""
     density = pyro.sample("density", dist.Uniform(0.5, 2.0))

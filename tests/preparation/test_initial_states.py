@@ -7,9 +7,13 @@ from hidden_rigs import RIGS
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.preparation.initial_states import error_draws, error_factors
+from npdr_ppl.language.handlers import with_finer_steps
+from npdr_ppl.models.pendulum import pendulum
+from npdr_ppl.preparation.initial_states import error_draws, error_factors, estimate_starts
+from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts.states import ERROR_RATIOS, estimate_departures
+from tests.helpers.pendulum_recordings import TRUTH, jerked
 from tests.helpers.rig_recordings import recording_of
 
 
@@ -93,6 +97,19 @@ def test_starts_along_a_fit_are_as_far_off_as_they_say_and_command_changes_do_no
         return float((error @ change).square() / (error @ error) / (change @ change))
 
     assert bias(inputs) < 0.05
+
+
+def test_rates_are_right_where_commands_jump_although_only_angles_were_recorded():
+    rollouts, velocities = jerked(every=20)
+    fine = with_finer_steps(pendulum)  # of order four, whose velocities are those at each step
+    segments = SegmentModel(fine, rollouts, npdr.DataOptions(segment_length=20))
+    z = segments.place_of({name: torch.tensor(value) for name, value in TRUTH.items()})
+    starts = estimate_starts(segments.black_box(z[None]), segments.inputs, rollouts)
+    later = segments.inputs.start[1:]
+    error = starts.rates[1:, 0] - torch.tensor(velocities)[later]
+    assert float((error / starts.rate_errors[1:, 0]).square().mean().sqrt()) < 1.3
+    # A central difference would be off by a quarter of the change of acceleration in a step.
+    assert float(error.abs().max()) < 0.01
 
 
 def test_draws_of_the_errors_have_the_moments_of_their_posterior():
