@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.engines.workers import collect_faults
+from npdr_ppl.errors import NpdrError
 from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.handlers import num_finer_steps
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
     from npdr_ppl.arviz_module import Data
 
 __all__ = ["describe", "fit"]
+
+FITS = ".fits"
+"""Name of the folder in which an interrupted fit has kept the fits of its search."""
 
 
 def fit(
@@ -57,8 +61,8 @@ def fit(
         train: Rollouts to fit.
         test: Held-out rollouts to report on; the fitted ones if ``None``.
         out: Folder for ``posterior.nc``, ``fit.json`` and the run itself, from which an
-            interrupted fit continues; its search for the closest parameters is in ``fits`` until
-            it has ended. Nothing is written if ``None``.
+            interrupted fit continues; until its end, the search for the closest parameters is
+            kept there, too. Nothing is written if ``None``.
         backend: The inference backend.
         rounds: Rounds of simulating and training.
         extra_rounds: Rounds that the diagnosis may add where the estimator has not converged.
@@ -71,21 +75,25 @@ def fit(
     Returns:
         The posterior and the content of ``fit.json``.
     """
-    fits = None if out is None else out / "fits"
-    with reporter(progress) as report:
-        with collect_faults() as before, keep_fits(fits):
-            prepared = prepare(
-                model,
-                train,
-                checked_options(options),
-                seed=seed,
-                progress=report.stage("find the closest parameters"),
-            )
+    fits = None if out is None else out / FITS
+    is_new = out is not None and not out.exists()
+    with reporter(progress) as report, claimed(out):
+        try:
+            with collect_faults() as before, keep_fits(fits):
+                prepared = prepare(
+                    model,
+                    train,
+                    checked_options(options),
+                    seed=seed,
+                    progress=report.stage("find the closest parameters"),
+                )
+        except NpdrError:
+            if is_new:  # a recording that does not fit the model leaves no folder
+                shutil.rmtree(cast(Path, out), ignore_errors=True)
+            raise
         options = prepared.options
         started = time.perf_counter()
         with ExitStack() as stack, collect_faults() as after:
-            # Not before: a recording that does not fit the model leaves no folder.
-            stack.enter_context(claimed(out))
             folder = (
                 stack.enter_context(TemporaryDirectory(prefix="npdr-")) if out is None else out
             )

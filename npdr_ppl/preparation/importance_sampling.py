@@ -104,7 +104,7 @@ class _Proposal:
             log_density = self.density.log_prob(z).double().cpu()
         else:
             log_density = self.density.log_prob(w).double() + self.space.log_jacobian(z)
-        return (log_density + math.log(self.num_draws)).nan_to_num(-math.inf)
+        return (log_density + math.log(self.num_draws)).nan_to_num(-math.inf, -math.inf, -math.inf)
 
 
 def heavy_tailed(mean: Tensor, covariance: Tensor) -> GaussianMixture:
@@ -176,6 +176,8 @@ def sample_posterior(
         smoothed, k_hat = smoothed_weights(log_weights)
         size = effective_size(smoothed)
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
+        # If hardly any draw has a weight, all are set equal; see :func:`smoothed_weights`.
+        size = size if math.isfinite(k_hat) else 0.0
         report(f"{len(z)} draws, {size:.0f} of {settings.enough_effective:.0f} effective ones")
         if result.k_hat <= settings.reliable_k and result.effective >= settings.enough_effective:
             break

@@ -233,12 +233,6 @@ def _predicted_rates(
     ports = [simulator.port(effect.port) for effect in effects]
     if any(port.kind == "clock" for port in ports):
         return rates
-    if effects:
-        plain = copy.copy(simulator)
-        plain.effects = tuple(e for e in simulator.effects if not isinstance(e, SensorEffect))
-        own = {name for effect in effects for name in effect.parameter_names}
-        rest = {name: value for name, value in box.parameters.items() if name not in own}
-        simulated = _simulated(plain, rest, inputs)
     changed = {name for port in ports for name in port.channels}
     reported = [sensor.name for sensor in simulator.sensors]
     columns = {name: i for i, name in enumerate(inputs.channel_names)}
@@ -247,6 +241,12 @@ def _predicted_rates(
         for state in simulator.states
         if state.rate_of in columns and state.rate_of not in changed and state.name in reported
     }
+    if known and effects:
+        plain = copy.copy(simulator)
+        plain.effects = tuple(e for e in simulator.effects if not isinstance(e, SensorEffect))
+        own = {name for effect in effects for name in effect.parameter_names}
+        rest = {name: value for name, value in box.parameters.items() if name not in own}
+        simulated = _simulated(plain, rest, inputs)
     # The first state is not simulated, and not needed.
     there = simulated[row, (places - 1).clamp_min(0)]
     for column, sensor in known.items():

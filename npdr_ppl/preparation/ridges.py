@@ -38,7 +38,8 @@ class RidgeCoordinates:
 
     Attributes:
         space: The coordinates y from which w are computed.
-        centre: The most likely point near the closest fit in them, ``(d,)``.
+        centre: The point near the closest fit with the greatest density over reference
+            coordinates, mapped to y, ``(d,)``.
         basis: Columns map w − shear to y − centre, ``(d, d)``.
         information: Information of the recording in units of the prior's, ``(d,)``; ascending
             among the weak coordinates and among the others.
@@ -67,7 +68,7 @@ class RidgeCoordinates:
         Args:
             likelihood: The recording's likelihood.
             seed: Seed of the points of a ridge.
-            is_rough: Whether ridges are taken as straight, which needs no simulations.
+            is_rough: Whether ridges are taken as straight, which needs few simulations.
         """
         z, known = likelihood.fit.z, likelihood.information()
         # Even with all others known, the recording says less about these than the prior.
@@ -81,7 +82,7 @@ class RidgeCoordinates:
         # prior. The direction can be weak if that exceeds the width of the stiffest one.
         can_be_weak = 0 if is_rough else int((information**2 < information[-1]).sum())
         basis = spread[:, None] * vectors
-        centre = space.from_reference(_most_likely(likelihood)[None])[0]
+        centre = space.from_reference(_most_likely(likelihood, known)[None])[0]
         straight = cls._straight(space, centre, basis, information, 0)
         is_weak = torch.zeros(len(z), dtype=torch.bool)
         is_weak[:can_be_weak] = True
@@ -169,7 +170,7 @@ class RidgeCoordinates:
     def tensors(self) -> dict[str, Tensor]:
         """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""
         return {
-            "is_reference": self.space.is_reference,
+            **self.space.tensors(),
             "centre": self.centre,
             "basis": self.basis,
             "information": self.information,
@@ -184,7 +185,7 @@ class RidgeCoordinates:
         """Rebuilds coordinates of a prior from :meth:`tensors`."""
         num_weak, degree = tensors["shape"].tolist()
         return cls(
-            SamplingCoordinates.of(prior, tensors["is_reference"]),
+            SamplingCoordinates.of_tensors(prior, tensors),
             tensors["centre"],
             tensors["basis"],
             tensors["information"],
@@ -328,7 +329,7 @@ class RidgeCoordinates:
         return self if bend is None else replace(self, bend=bend)
 
 
-def _most_likely(likelihood: SegmentLikelihood) -> Tensor:
+def _most_likely(likelihood: SegmentLikelihood, information: Tensor) -> Tensor:
     """Returns the most likely point near the closest fit, ``(d,)``.
 
     The fit counts all measurements, as if they were independent. With their effective number, the
@@ -337,12 +338,13 @@ def _most_likely(likelihood: SegmentLikelihood) -> Tensor:
 
     Args:
         likelihood: The recording's likelihood.
+        information: Its information at the closest fit, ``(d, d)``.
     """
     z, prior = likelihood.fit.z, likelihood.segments.prior
     eye = torch.eye(len(z), dtype=torch.float64)
     factors = torch.tensor(RIDGE.centre_steps, dtype=torch.float64)[:, None]
     tried, best = z[None], -torch.inf
-    for _ in range(RIDGE.most_centre_steps):
+    for _ in range(RIDGE.most_centre_steps + 1):
         scores, misfits = likelihood.scores(tried)
         density = (prior.log_prob(tried).double() - 0.5 * misfits).nan_to_num(-torch.inf)
         chosen = int(density.argmax())
@@ -352,6 +354,6 @@ def _most_likely(likelihood: SegmentLikelihood) -> Tensor:
         z, best = tried[chosen], float(density[chosen])
         if gain < RIDGE.centre_gain:
             break
-        change = torch.linalg.solve(likelihood.information() + eye, scores[chosen] - z)
+        change = torch.linalg.solve(information + eye, scores[chosen] - z)
         tried = z + factors * change.nan_to_num(0.0)
     return z

@@ -2,10 +2,11 @@
 
 A motion determines products and ratios of masses, lengths and gains. If several parameters occur
 only in one product, the posterior is a ridge. The ridge is curved in the prior's reference
-coordinates and straight in the parameters' logarithms. Parameters about which a recording says
-little are as the prior says, which is normal in its reference coordinates only.
+coordinates and straight in the parameters' logarithms. The posterior of a parameter about which a
+recording says little is the prior, and that is normal in reference coordinates only.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,6 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.preparation.settings import SAMPLING_COORDINATES
 
@@ -74,11 +76,39 @@ class SamplingCoordinates:
         if not torch.allclose(_columns(prior, alone).diagonal(), high):
             return rest
         is_far_from_zero = high < SAMPLING_COORDINATES.widest_ratio * low
-        is_log_normal = torch.isclose(low * high, middle.square(), rtol=1e-6, atol=0.0)
-        is_reference = none if undetermined is None else undetermined
+        # Sites are in single precision.
+        is_log_normal = torch.isclose(low * high, middle.square(), rtol=1e-4, atol=0.0)
+        keeps = undetermined is not None and prior.is_standard_normal
+        is_reference = undetermined if keeps else none
         is_logarithm = (low > 0.0) & (is_far_from_zero | is_log_normal) & ~is_reference
         raw = cls(prior, True, is_logarithm, is_reference, ones)
-        return cls(prior, True, is_logarithm, is_reference, raw.from_reference(z).var(0))
+        return replace(raw, variance=raw.from_reference(z).var(0))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Returns the tensors from which, with the prior, the coordinates can be rebuilt."""
+        return {
+            "is_elementwise": torch.tensor(self.is_elementwise),
+            "is_logarithm": self.is_logarithm,
+            "is_reference": self.is_reference,
+            "variance": self.variance,
+        }
+
+    @classmethod
+    def of_tensors(cls, prior: Prior, tensors: Mapping[str, Tensor]) -> "SamplingCoordinates":
+        """Rebuilds coordinates of a prior from :meth:`tensors`.
+
+        Raises:
+            DataError: They are of an earlier version.
+        """
+        if "is_reference" not in tensors:
+            raise DataError("The posterior is of an earlier version of npdr_ppl; fit it again.")
+        return cls(
+            prior,
+            bool(tensors["is_elementwise"]),
+            tensors["is_logarithm"],
+            tensors["is_reference"],
+            tensors["variance"],
+        )
 
     def from_reference(self, z: Tensor) -> Tensor:
         """Maps reference coordinates ``(n, d)`` to y."""
@@ -123,9 +153,13 @@ class SamplingCoordinates:
     @cached_property
     def _left_out(self) -> Tensor:
         """Σ log |∂θ/∂z| of the parameters with reference coordinates, where these are zero."""
-        plain = replace(self, is_reference=torch.zeros_like(self.is_reference))
-        slope = plain.slope(torch.zeros(len(self.variance), dtype=torch.float64))
-        return slope[self.is_reference].log().sum()
+        middle = self.prior.to_parameters(torch.zeros(1, len(self.variance)).double())
+        total = torch.zeros((), dtype=torch.float64)
+        for site, is_left_out in zip(self.prior.sites, self.is_reference, strict=True):
+            if is_left_out:
+                density = self.prior.distributions[site.name].log_prob(middle[site.name])
+                total = total - 0.5 * math.log(2.0 * math.pi) - density.double().sum()
+        return total
 
     def slope(self, z: Tensor) -> Tensor:
         """Returns ∂y/∂z of each coordinate at one point ``(d,)``, shape ``(d,)``."""

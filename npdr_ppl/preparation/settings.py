@@ -300,7 +300,7 @@ class ImportanceSamplingSettings:
             recording.
         most_iterations: Greatest number of iterations.
         iterations_to_adapt: Number of iterations after which sampling ends if fewer draws are
-            effective than there are parameters. Further proposals then hardly come nearer.
+            effective than there are parameters: too few to tell a proposal's covariance.
         reliable_k: Greatest Pareto shape k̂ of the weights with which estimates are reliable
             (Vehtari et al. 2024).
         enough_effective: Effective sample size at which sampling ends. The ends of a 90 % interval

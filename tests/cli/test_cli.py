@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from npdr_ppl.posterior.fit import FITS
 from npdr_ppl.preparation.segment_fit import fit_segments
 from npdr_ppl.rollouts import Rollouts
 from tests.helpers.command_line import assert_prints_sentence, run
@@ -179,7 +180,7 @@ def test_a_killed_fit_continues_to_the_same_result(monkeypatch, capsys, tmp_path
         results.append(json.loads((out / "fit.json").read_text()))
     assert results[0]["parameters"] == results[1]["parameters"]
     assert results[0]["metrics"] == results[1]["metrics"]
-    assert not (killed / "fits").exists()
+    assert not (killed / FITS).exists()
 
 
 def test_an_interrupted_fit_has_kept_its_closest_parameters(
@@ -251,6 +252,7 @@ def test_bad_input_gets_one_sentence(monkeypatch, capsys, tmp_path, recording, w
     assert sentence in err
     assert "Traceback" not in err
     assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,7 @@ def test_servo_gain_is_gain_and_bias():
     assert torch.equal(out, stiff.simulate({}, inputs))
 
 
-def test_a_loaded_joint_creeps_the_less_the_harder_its_friction_is(tmp_path):
+def test_a_loaded_joint_creeps_less_if_its_friction_is_harder(tmp_path):
     path = tmp_path / "held.xml"
     path.write_text(
         '<mujoco><option timestep="0.001"/><worldbody><body>'

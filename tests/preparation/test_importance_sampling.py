@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from npdr_ppl.engines.ode.simulator import ODESimulator
+from npdr_ppl.errors import DataError
 from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.models.pendulum import pendulum
@@ -102,6 +103,38 @@ def test_parameters_that_do_nothing_cost_no_draws():
     mean, covariance = found.moments()
     assert float(mean[idle].abs().max()) < 0.3
     assert float((covariance.diagonal()[idle].sqrt() - 1.0).abs().max()) < 0.3
+
+
+def known_gravity(inputs):
+    """A pendulum with a parameter that does nothing and is known well in advance."""
+    pyro.sample("gravity", dist.LogNormal(2.283, 0.001))
+    return pendulum(inputs)
+
+
+def test_the_volume_of_reference_coordinates_is_that_of_finite_differences():
+    likelihood = prepare(many_idle, swinging(rollouts=1, steps=200), DataOptions()).likelihood
+    prior = likelihood.segments.prior
+    z = 0.5 * torch.ones(1, prior.num_parameters)
+    mask = torch.tensor([site.name.startswith("uniform") for site in prior.sites])
+    space = SamplingCoordinates.of(prior, mask)
+    found = space.log_jacobian(z.double(), space.from_reference(z.double()))
+    torch.testing.assert_close(found[0], space.slope(z[0].double()).log().sum(), rtol=0, atol=0.05)
+    again = SamplingCoordinates.of_tensors(prior, space.tensors())
+    assert torch.equal(again.from_reference(z), space.from_reference(z))
+    with pytest.raises(DataError, match="earlier version"):
+        SamplingCoordinates.of_tensors(prior, {})
+
+
+def test_a_narrow_prior_of_a_parameter_that_does_nothing_is_kept():
+    likelihood = prepare(known_gravity, swinging(rollouts=1, steps=200), DataOptions()).likelihood
+    prior = likelihood.segments.prior
+    space = SamplingCoordinates.of(prior, torch.tensor([s.name == "gravity" for s in prior.sites]))
+    z = torch.zeros(1, prior.num_parameters, dtype=torch.float64)
+    assert bool(space.log_jacobian(z, space.from_reference(z)).isfinite())
+    mean, covariance = sample_posterior(likelihood, seed=0).moments()
+    (place,) = space.is_reference.nonzero()[:, 0]
+    assert abs(float(mean[place])) < 0.3
+    assert float(covariance[place, place].sqrt()) == pytest.approx(1.0, abs=0.3)
 
 
 def test_a_log_normal_parameter_is_sampled_by_its_logarithm():

@@ -306,8 +306,9 @@ def _softness_entries(model: Any, joint: int, quantity: str, text: str) -> list[
     The engine's friction holds a joint only nearly: under a force f below the friction loss, the
     joint creeps at about T f (1 − d) / (2 d m), where d is the first number of ``solimpfriction``,
     T that of ``solreffriction`` and m the joint's inertia. A joint that stops is slowed during T.
-    The softness is 1 − d, and T decreases linearly with it, to two of the file's steps at zero.
-    The engine allows impedances of 0.0001 to 0.9999 and time constants of at least two steps.
+    The softness is 1 − d, and T decreases linearly with it, to two of the file's steps at zero; it
+    stays as it is if the file has a shorter one, or a stiffness in its place. The engine allows
+    impedances of 0.0001 to 0.9999 and time constants of at least two steps.
     """
     impedances, times = (
         _entries(model, "joint", joint, info, "")
@@ -317,7 +318,7 @@ def _softness_entries(model: Any, joint: int, quantity: str, text: str) -> list[
     least = 2.0 * float(model.opt.timestep)
     for time, impedance in zip(times, impedances, strict=True):
         softness = 1.0 - impedance.nominal
-        if softness > 0.0 and time.nominal > least:  # a negative number is a stiffness
+        if softness > 0.0 and time.nominal > least:  # minus a stiffness is negative
             factor = (time.nominal - least) / softness
             found.append(time._replace(factor=factor, offset=least))
     return found
