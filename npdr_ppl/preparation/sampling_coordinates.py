@@ -78,8 +78,9 @@ class SamplingCoordinates:
         is_far_from_zero = high < SAMPLING_COORDINATES.widest_ratio * low
         # Sites are in single precision.
         is_log_normal = torch.isclose(low * high, middle.square(), rtol=1e-4, atol=0.0)
-        keeps = undetermined is not None and prior.is_standard_normal
-        is_reference = undetermined if keeps else none
+        is_reference = none
+        if undetermined is not None and prior.is_standard_normal:
+            is_reference = undetermined
         is_logarithm = (low > 0.0) & (is_far_from_zero | is_log_normal) & ~is_reference
         raw = cls(prior, True, is_logarithm, is_reference, ones)
         return replace(raw, variance=raw.from_reference(z).var(0))
