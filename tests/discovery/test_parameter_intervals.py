@@ -153,6 +153,10 @@ def test_a_ridge_is_traced_inside_the_support(monkeypatch):
     def all_curved(self, likelihood, num):
         return torch.ones(num, dtype=torch.bool)
 
+    def at_the_fit(likelihood, information):
+        return likelihood.fit.z  # otherwise its scores are among the first that are seen
+
+    monkeypatch.setattr("npdr_ppl.preparation.ridges._most_likely", at_the_fit)
     monkeypatch.setattr(RidgeCoordinates, "to_reference", leaving)
     monkeypatch.setattr(RidgeCoordinates, "_most_curved", all_curved)
     monkeypatch.setattr(SegmentLikelihood, "scores", seen)
