@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def fit(
         The posterior and the content of ``fit.json``.
     """
     fits = None if out is None else out / FITS
-    is_new = out is not None and not out.exists()
+    was_there = out is not None and out.exists()
     with reporter(progress) as report, claimed(out):
         try:
             with collect_faults() as before, keep_fits(fits):
@@ -88,8 +88,9 @@ def fit(
                     progress=report.stage("find the closest parameters"),
                 )
         except NpdrError:
-            if is_new:  # a recording that does not fit the model leaves no folder
-                shutil.rmtree(cast(Path, out), ignore_errors=True)
+            # A recording that does not fit the model leaves no folder; finished fits stay.
+            if out is not None and not was_there and not (out / FITS).exists():
+                shutil.rmtree(out, ignore_errors=True)
             raise
         options = prepared.options
         started = time.perf_counter()
