@@ -59,8 +59,8 @@ def found_names(row: Row) -> list[str]:
 
 
 def large_effects(row: Row) -> list[Row]:
-    """Returns the effects that were found and are not too small to be named."""
-    return [e for e in row.get("effects", []) if not e.get("is_minor")]
+    """Returns the effects that were found, without small ones and corrections of the model."""
+    return [e for e in row.get("effects", []) if not e.get("is_minor") and not e.get("corrects")]
 
 
 def right_sets(row: Row) -> list[set[str]]:

@@ -191,6 +191,7 @@ class EffectRecord(TypedDict):
     parameters: NotRequired[dict[str, EffectInterval] | None]
     share: NotRequired[Number]
     is_minor: NotRequired[bool]
+    corrects: NotRequired[str]
     parts: NotRequired[list[EffectPart]]
     in_halves: NotRequired[dict[str, bool]]
     found_in: NotRequired[list[PartRecord]]

@@ -72,6 +72,11 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
+        for effect in found["effects"]:
+            if effect.get("corrects"):
+                name = f"{effect['port']}.{effect['effect']}"
+                told = f"{name} corrects {effect['corrects']} of the model, and is not named."
+                console.print(escape(told), highlight=False)
         uncompared = [
             f"{e['port']}.{e['effect']}" for e in found["effects"] if e["probability"] is None
         ]

@@ -30,6 +30,8 @@ class Finding:
             law.
         is_minor: Whether it explains too little to be named: no strength differs from zero by two
             standard deviations, or its share is small and something remains that no law explains.
+        corrects: Number of the model that it corrects; empty if it is a missing effect. See
+            :meth:`~npdr_ppl.language.simulator.Simulator.corrected_number`.
         repetition: Its strengths in parts of the recording; ``None`` for short recordings.
         found_in: Whether each half of the recording shows it, and the recording without each of
             its rollouts; empty if it was not sought there.
@@ -45,6 +47,7 @@ class Finding:
     parameters: dict[str, Estimate]
     at_edge: tuple[str, ...] = ()
     is_minor: bool = False
+    corrects: str = ""
     repetition: Repetition | None = None
     found_in: tuple[PartResult, ...] = ()
     is_compared: bool = True
@@ -56,8 +59,8 @@ class Finding:
 
     @property
     def can_be_named(self) -> bool:
-        """Whether it is large enough, and is found again in parts of the recording."""
-        return not self.is_minor and not self.doubt
+        """Whether it is missing, large enough, and found again in parts of the recording."""
+        return not self.is_minor and not self.corrects and not self.doubt
 
     @property
     def doubt(self) -> str:
@@ -82,6 +85,7 @@ class Finding:
             "parameters": {name: e.to_dict() for name, e in self.parameters.items()},
             "at_edge": list(self.at_edge),
             "is_minor": self.is_minor,
+            "corrects": self.corrects,
             "is_found_again": self.is_found_again,
             "parts": [] if self.repetition is None else self.repetition.to_list(),
             "in_halves": self.in_halves,

@@ -93,6 +93,7 @@ def finding_of(
         },
         at_edge,
         is_zero or is_small,
+        search.final.simulator.corrected_number(effect),
         repetition,
         tuple(found_in),
         added.is_compared,

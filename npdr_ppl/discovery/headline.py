@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from npdr_ppl.drawing.bars_html import METRICS
-from npdr_ppl.drawing.effect_names import effect_label, in_words
+from npdr_ppl.drawing.effect_names import effect_label, in_words, why_unnamed
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["headline", "told_doubt"]
@@ -35,9 +35,7 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
     """
     word = str(result.get("verdict", "no verdict"))
     effects = result.get("effects") or []
-    large = [
-        effect for effect in effects if not effect.get("is_minor") and not told_doubt(effect)
-    ] or effects
+    large = [e for e in effects if not why_unnamed(e) and not told_doubt(e)] or effects
     labels = [effect_label(effect) for effect in large]
     p_value = number((result.get("alarm") or {}).get("p_value"))
     gained = _gained(result.get("gap") or {})

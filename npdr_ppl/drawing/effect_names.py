@@ -7,7 +7,7 @@ from typing import Any
 
 from npdr_ppl.drawing.numbers import number
 
-__all__ = ["TITLES", "effect_label", "effect_title", "in_words", "quantity"]
+__all__ = ["TITLES", "effect_label", "effect_title", "in_words", "quantity", "why_unnamed"]
 
 TITLES = {
     "actuator_gain": "{where} gain error",
@@ -64,6 +64,17 @@ _CHANNEL = re.compile(r"(?<![\w./-])[A-Za-z0-9]+(?:_[A-Za-z0-9]+)+(?![\w/(]|\.\w
 
 _SHARES = ("error", "skew")
 """Parameters that are relative errors; they are shown in per cent."""
+
+
+def why_unnamed(effect: Mapping[str, Any]) -> str:
+    """Returns in a word or two why an effect of the revised model is not named; empty if it is.
+
+    Args:
+        effect: The effect in ``discovery.json``.
+    """
+    if number_of_model := effect.get("corrects"):
+        return f"corrects {number_of_model}"
+    return "small" if effect.get("is_minor") else ""
 
 
 def effect_title(effect: str, port: str) -> str:

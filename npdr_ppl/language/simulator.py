@@ -121,6 +121,18 @@ class Simulator(ABC):
         """Returns whether an action is the goal of a servo."""
         return any(port.name == action and port.kind == "servo" for port in self.ports)
 
+    def corrected_number(self, effect: Effect) -> str:
+        """Returns the number of the model that may be wrong and that an effect would correct.
+
+        It is no parameter, because recordings do not determine it beside the parameters, unless
+        another effect is added. A correction is no missing effect, and can have either sign.
+        Empty if there is none.
+
+        Args:
+            effect: An effect that can be attached.
+        """
+        return ""
+
     @property
     def joints_of_unknown_speed(self) -> Mapping[str, str]:
         """Force ports whose rated speed is a guess, and the state that is their joint's position.

@@ -18,6 +18,13 @@ def test_effects_are_listed_up_to_a_number_and_then_counted():
     assert headline(found(*names))[0] == "Missing: constant force at hinge, and 3 more effects"
 
 
+def test_corrections_and_small_effects_are_not_in_the_headline():
+    result = found("servo_force_limit", "viscous_friction", "bias")
+    result["effects"][1]["corrects"] = "joint hinge damping"
+    result["effects"][2]["is_minor"] = True
+    assert headline(result)[0] == "Missing: hinge force limit"
+
+
 @pytest.mark.parametrize(
     ("gap", "sentence"),
     [

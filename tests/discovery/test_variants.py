@@ -3,13 +3,19 @@
 import numpy as np
 import pyro
 import pytest
-from pyro.distributions import HalfNormal, LogNormal, Uniform
+from pyro.distributions import HalfNormal, LogNormal, Normal, Uniform
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.language.channels import Port
-from npdr_ppl.models.effects import ActuatorLag, CoulombFriction, InputDelay, QuadraticDrag
+from npdr_ppl.models.effects import (
+    ActuatorLag,
+    CoulombFriction,
+    InputDelay,
+    QuadraticDrag,
+    ViscousFriction,
+)
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
@@ -105,3 +111,34 @@ def test_a_search_takes_the_speed_of_a_robots_joints_from_the_recording(tmp_path
     expected = HalfNormal(0.1 * port.rated / 1.2**2)
     ratio = drag.priors(port)["drag"].variance.sqrt() / expected.variance.sqrt()
     assert 0.8 < float(ratio) < 1.5
+
+
+def test_damping_that_a_robots_model_holds_may_be_corrected_downwards(tmp_path):
+    xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 0 1" damping="0.1"/>
+      <geom size="0.1" mass="1"/></body></worldbody>
+      <actuator><position name="servo" joint="hinge" kp="10" kv="1"/></actuator></mujoco>"""
+    (tmp_path / "robot.xml").write_text(xml)
+    rollouts = Rollouts.from_arrays(
+        readings=np.zeros((1, 41, 1)), actions=np.zeros((1, 40, 1)), channel_names=("hinge",),
+        action_names=("servo",), time_step=0.01,
+    )  # fmt: skip
+
+    def prior(held, **given):
+        robot = npdr.MujocoSimulator(
+            tmp_path / "robot.xml", {"kv": "actuator servo kv"}, held=held
+        )
+
+        def model(inputs):
+            kv = pyro.sample("kv", Uniform(0.5, 2.0))
+            return npdr.simulate("trajectory", robot, {"kv": kv}, inputs)
+
+        fitted = fit_hypothesis(model, rollouts, DataOptions(None, 20, "estimated"), max_steps=0)
+        options = npdr.DiscoveryOptions(effects=(ViscousFriction("hinge_torque", **given),))
+        (effect,) = candidates_at(fitted, options)
+        return effect.priors(robot.port("hinge_torque"))["damping"]
+
+    known, uncertain = prior(()), prior(["joint hinge damping"])
+    assert isinstance(known, HalfNormal) and isinstance(uncertain, Normal)
+    assert float(uncertain.mean) == 0.0 and uncertain.cdf(known.scale) > 0.84
+    given = HalfNormal(0.02)
+    assert prior(["joint hinge damping"], priors={"damping": given}) is given

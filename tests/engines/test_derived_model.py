@@ -15,6 +15,7 @@ from npdr_ppl.engines.mujoco.derived_model import derive_model
 from npdr_ppl.engines.mujoco.export import export_mjcf
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import ViscousFriction
 
 ARM = """
 <mujoco>
@@ -126,6 +127,7 @@ def test_the_python_simulates_as_an_edited_file_does(arm):
     assert isinstance(priors["shoulder_servo_kp"], dist.LogNormal)
     assert isinstance(priors["upper_mass"], dist.Uniform)
     assert set(priors) == {p.name for p in robot.parameters}
+    assert robot.corrected_number(ViscousFriction("shoulder_torque")) == "joint shoulder damping"
     values = {name: trace.nodes[name]["value"].double() for name in priors}
     # The same changes, made in the text of the file.
     spec = mujoco.MjSpec.from_file(str(arm))

@@ -262,11 +262,23 @@ def test_a_parameter_without_a_field_enters_derived_ones():
         ({"bounds": {"elbw": (0, 1)}}, "did you mean 'elbow'"),
         ({"keyframe": "raise"}, "did you mean 'raised'"),
         ({"substeps": 0}, "substeps"),
+        ({"held": ["joint shoulder dampng"]}, "did you mean 'damping'"),
     ],
 )
 def test_errors_name_what_exists(options, message):
     with pytest.raises(ModelError, match=message):
         arm(**options)
+
+
+def test_viscous_friction_corrects_damping_that_is_held():
+    simulator = arm(held=["joint elbow damping", "body hand mass"])
+    ports = [port.name for port in simulator.ports if port.kind == "force"]
+    elbow, shoulder = (next(p for p in ports if p.startswith(n)) for n in ("elbow", "shoulder"))
+    assert simulator.corrected_number(ViscousFriction(elbow)) == "joint elbow damping"
+    assert simulator.corrected_number(ViscousFriction(shoulder)) == ""
+    assert simulator.corrected_number(CoulombFriction(elbow)) == ""
+    every = simulator.with_effects(CoulombFriction(elbow)).with_finer_steps()
+    assert every.corrected_number(ViscousFriction(elbow)) == "joint elbow damping"
 
 
 def test_files_and_inputs_that_do_not_fit(tmp_path):

@@ -43,8 +43,10 @@ def candidates_at(hypothesis: Hypothesis, options: DiscoveryOptions) -> tuple[Ef
     for effect in candidates:
         if not effect.is_noise:
             port = simulator.port(effect.port)
+            may_be_negative = not effect.given_priors and simulator.corrected_number(effect)
             effect = effect.at_rate(port, time_step)
-            result.append(effect.at_speed(port, speeds.get(effect.port, port.rated_speed)))
+            effect = effect.at_speed(port, speeds.get(effect.port, port.rated_speed))
+            result.append(effect.of_either_sign(port) if may_be_negative else effect)
     return tuple(result)
 
 

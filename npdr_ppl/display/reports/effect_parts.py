@@ -12,7 +12,7 @@ from npdr_ppl.display.reports.content import (
     TextPart,
 )
 from npdr_ppl.drawing.bars_html import named_bars
-from npdr_ppl.drawing.effect_names import effect_label, effect_title, in_words
+from npdr_ppl.drawing.effect_names import effect_label, effect_title, in_words, why_unnamed
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["effects_section", "estimates_section"]
@@ -35,14 +35,22 @@ def effects_section(effects: Rows, ranking: Rows) -> Section:
         [
             effect_label(effect),
             number(effect.get("probability"), ".0%"),
-            number(effect.get("share"), ".0%") + (" (small)" if effect.get("is_minor") else ""),
+            number(effect.get("share"), ".0%") + _bracketed(why_unnamed(effect)),
             _others(effect.get("equivalent_to") or []),
         ]
         for effect in effects
     ]
     columns = ("effect", "probability", "share of the misfit", "could also be")
-    is_any_small = any(effect.get("is_minor") for effect in effects)
-    caption = "Small effects are in the revised model, but are not named." if is_any_small else ""
+    captions = {
+        "Small effects are in the revised model, but are not named.": any(
+            effect.get("is_minor") for effect in effects
+        ),
+        "What corrects a number of the model is not missing: the number was no parameter, because "
+        "recordings do not determine it without the other effects.": any(
+            effect.get("corrects") for effect in effects
+        ),
+    }
+    caption = " ".join(text for text, is_needed in captions.items() if is_needed)
     folded = [*_parameters(effects), *_repeated(effects), *_found_in(effects)]
     parts = [TablePart(columns, rows, caption)]
     if folded:
@@ -70,6 +78,10 @@ def estimates_section(parameters: Mapping[str, Any]) -> list[Section]:
     return [
         Section("Parameters of the model", [TablePart(columns, rows, "In the revised model.")])
     ]
+
+
+def _bracketed(why: str) -> str:
+    return f" ({why})" if why else ""
 
 
 def _others(names: Sequence[Any]) -> str:

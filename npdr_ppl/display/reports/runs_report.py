@@ -20,7 +20,7 @@ from npdr_ppl.display.reports.content import (
 )
 from npdr_ppl.display.reports.run_summary import Estimate, RunSummary, summaries
 from npdr_ppl.drawing.bars_html import METRICS, interval_bars
-from npdr_ppl.drawing.effect_names import effect_label, effect_title
+from npdr_ppl.drawing.effect_names import effect_label, effect_title, why_unnamed
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.errors import DataError
 
@@ -160,7 +160,7 @@ def _differing_effects(runs: Runs) -> list[str]:
 
 
 def _large(run: RunSummary) -> list[str]:
-    return [_title(effect) for effect in run.effects or () if not effect.get("is_minor")]
+    return [_title(effect) for effect in run.effects or () if not why_unnamed(effect)]
 
 
 def _title(effect: Mapping[str, Any]) -> str:
@@ -257,8 +257,8 @@ def _found(run: RunSummary, title: str) -> str:
         if _title(effect) == title:
             size = effect_label(effect).removeprefix(title).removeprefix(", ")
             parts = [size, number(effect.get("probability"), ".0%")]
-            small = " (small)" if effect.get("is_minor") else ""
-            return ", ".join(part for part in parts if part) + small
+            why = why_unnamed(effect)
+            return ", ".join(part for part in parts if part) + (f" ({why})" if why else "")
     return "–"
 
 

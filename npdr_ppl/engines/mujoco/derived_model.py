@@ -83,7 +83,7 @@ PRIORS = {{
 {priors}
 }}
 {held}
-robot = npdr.MujocoSimulator({path}, PARAMETERS)
+robot = npdr.MujocoSimulator({path}, PARAMETERS{also})
 
 
 def model(inputs):
@@ -160,9 +160,10 @@ class DerivedModel:
             f'    "{p.name}": {p.prior},  # file: {p.nominal:.4g} {p.unit}'
             for p in self.parameters
         ]
-        held = [f"#   {_quoted(field)}: {_quoted(self.reason(field))}" for field in self.held]
+        held = [f"    {_quoted(field)}: {_quoted(self.reason(field))}," for field in self.held]
         if held:
-            held = ["", "# Not varied, because positions do not determine them:", *held]
+            title = "# Not varied, because positions do not determine them beside these."
+            held = ["", title, "HELD = {", *held, "}"]
         has_logarithms = any(p.family == "log-normal" for p in self.parameters)
         return _TEMPLATE.format(
             imports="import math\n\n" if has_logarithms else "",
@@ -170,6 +171,7 @@ class DerivedModel:
             priors="\n".join(priors),
             held="\n".join([*held, ""]),
             path=_quoted(str(path)),
+            also=", held=HELD" if held else "",
         )
 
 

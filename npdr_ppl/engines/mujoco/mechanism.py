@@ -30,7 +30,7 @@ from npdr_ppl.engines.mujoco.channels import (
     state_components,
 )
 from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
-from npdr_ppl.engines.mujoco.fields import element_names
+from npdr_ppl.engines.mujoco.fields import element_names, find_field
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
 from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
 from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
@@ -92,6 +92,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         substeps: int | None = None,
         num_threads: int | None = None,
         keyframe: str | None = None,
+        held: Iterable[str] = (),
     ) -> None:
         if substeps is not None and substeps < 1:
             raise ModelError(f"MujocoSimulator needs at least one substep, got {substeps=}.")
@@ -119,6 +120,7 @@ class MujocoMechanism(ClosedLoopSimulator):
         self._bound = parameters or {}, derived or {}
         self.bindings = Bindings(self.model, *self._bound)
         self.parameters = self.bindings.parameters
+        self._held_at = self._ports_with_held_damping(held)
         taken += [*self.joints, *(parameter.name for parameter in self.parameters)]
         self._environment = environment_ports(self.model, driven_dofs(self.model), taken)
         self.ports = (
@@ -138,6 +140,12 @@ class MujocoMechanism(ClosedLoopSimulator):
     def joints(self) -> tuple[str, ...]:
         """Names of the force ports."""
         return tuple(port.port.name for port in self.force_ports)
+
+    def corrected_number(self, effect: Effect) -> str:
+        """Returns the damping that viscous friction at the same joint would correct, if held."""
+        if not isinstance(effect, ForceEffect) or effect.standard_law != "damping":
+            return ""
+        return self._held_at.get(effect.port, "")
 
     @property
     def joints_of_unknown_speed(self) -> dict[str, str]:
@@ -378,6 +386,18 @@ class MujocoMechanism(ClosedLoopSimulator):
         for name in (*units, *bounds):
             if name not in all_names:
                 raise ModelError(f"{self.name} has no channel {name!r}; {hint(name, all_names)}")
+
+    def _ports_with_held_damping(self, held: Iterable[str]) -> dict[str, str]:
+        """Returns the held fields that are joints' damping, by the joint's force port."""
+        fields = {text: find_field(self.model, text) for text in held}
+        texts = {
+            entry.place: text
+            for text, field in fields.items()
+            for entry in field.entries
+            if entry.array == "dof_damping"
+        }
+        ports = self.force_ports
+        return {p.port.name: texts[p.velocity] for p in ports if p.velocity in texts}
 
     def _initial_positions(self, keyframe: str | None) -> Any:
         """Returns the qpos of components that are not states."""

@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import ClassVar, Self
 
 import torch
-from pyro.distributions import Uniform
+from pyro.distributions import Normal, Uniform
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, HalfNormal
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Parameter, Port, PortKind
@@ -164,6 +164,19 @@ class Effect(ABC):
             if name not in self._priors and _variance(prior) > _variance(own[name])
         }
         return self._with_further_priors(wider)
+
+    def of_either_sign(self, port: Port) -> Self:
+        """Returns the effect with normal priors in place of half-normal ones.
+
+        Args:
+            port: The port it attaches to.
+        """
+        signed = {
+            name: Normal(0.0, prior.scale)
+            for name, prior in self.priors(port).items()
+            if isinstance(prior, HalfNormal)
+        }
+        return self._with_further_priors(signed)
 
     def _with_further_priors(self, priors: Mapping[str, Distribution]) -> Self:
         """Returns a copy with further priors; the effect itself if there are none."""
