@@ -8,12 +8,14 @@ every point maps to a plausible parameter.
 
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import torch
 from pyro import poutine
+from pyro.distributions.torch_distribution import ExpandedDistribution
 from torch import Tensor
-from torch.distributions import constraints
+from torch.distributions import Independent, Uniform, constraints
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.handlers import SkipSimulation
@@ -177,6 +179,17 @@ class Prior:
         writer = WriteCoordinates(self.sites, z)
         self._run(writer)
         return writer.log_prob
+
+    @cached_property
+    def uniform_coordinates(self) -> Tensor:
+        """Mask ``(d,)`` of the coordinates of sites with uniform distributions."""
+        mask = torch.zeros(self.num_parameters, dtype=torch.bool)
+        for site in self.sites:
+            fn = self.distributions[site.name]
+            while isinstance(fn, ExpandedDistribution | Independent):
+                fn = fn.base_dist
+            mask[site.coordinates] = isinstance(fn, Uniform)
+        return mask
 
     def to_parameters(self, z: Tensor) -> dict[str, Tensor]:
         """Maps z, ``(n, d)``, to values of every latent site, ``(n,) + site.shape``."""

@@ -4,7 +4,8 @@ The offsets of the initial states are eliminated segment by segment, so that the
 the size of the parameters.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,10 +14,12 @@ from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.settings import SEGMENT_FIT
 from npdr_ppl.preparation.solving import solve_or_zero
 
-__all__ = ["possible_gain", "step"]
+__all__ = ["as_moved", "possible_gain", "step"]
 
 
-def possible_gain(now: Linearisation, z: Tensor, offsets: Tensor, held: Tensor) -> float:
+def possible_gain(
+    now: Linearisation, z: Tensor, offsets: Tensor, held: Tensor, uniform: Tensor
+) -> float:
     """Returns by how much the best step would reduce the objective if residuals were linear.
 
     Args:
@@ -24,13 +27,15 @@ def possible_gain(now: Linearisation, z: Tensor, offsets: Tensor, held: Tensor) 
         z: Parameters, ``(d,)``.
         offsets: Offsets, ``(S, m)``.
         held: Mask of coordinates that are not fitted, ``(d,)``; their derivatives are zero.
+        uniform: Mask of coordinates with uniform priors, ``(d,)``.
     """
     system = _System.of(now, z, offsets)
     eye = torch.eye(offsets.shape[-1], dtype=torch.float64)
     parts = solve_or_zero(system.own + eye, system.sides)[0]
     hessian, gradient = system.reduced(parts)
     gradient = gradient.masked_fill(held, 0.0)
-    change = solve_or_zero(hessian + torch.eye(len(z), dtype=torch.float64), gradient[:, None])[0]
+    prior = _curvature_of_prior(gradient, z, uniform)
+    change = solve_or_zero(hessian + torch.diag(prior), gradient[:, None])[0]
     by_offsets = (system.sides[..., -1] * parts[..., -1]).sum()
     return float(by_offsets + gradient @ change[:, 0])
 
@@ -83,11 +88,14 @@ def step(
     damping: float,
     dampings: Tensor,
     factors: tuple[float, ...],
+    uniform: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Returns parameters after one damped Gauss-Newton step, and offsets to try with them.
 
-    A segment whose own system cannot be solved keeps its offsets, which then count as known. If
-    the parameters' system cannot be solved, the parameters stay.
+    Derivatives by the coordinate of a uniform prior vanish towards its ends. So steps away from an
+    end are linear in the parameter, not in the coordinate: otherwise a fit that is to leave an end
+    would take many. A segment whose own system cannot be solved keeps its offsets, which then
+    count as known. If the parameters' system cannot be solved, the parameters stay.
 
     Args:
         now: Residuals and derivatives.
@@ -97,6 +105,7 @@ def step(
         damping: Damping of the parameters, relative to their curvatures.
         dampings: Damping of the offsets of each segment, ``(S,)``.
         factors: Multiples of ``dampings`` to try, among them 1.
+        uniform: Mask of coordinates with uniform priors, ``(d,)``.
 
     Returns:
         Parameters ``(d,)``, and offsets for each factor, ``(b, S, m)``.
@@ -108,12 +117,93 @@ def step(
         for f in factors
     }
     hessian, gradient = system.reduced(parts[1.0])
-    curvature = hessian.diagonal().clamp_min(1.0)
-    hessian = hessian + torch.diag(1.0 + damping * curvature)
-    change = solve_or_zero(hessian, gradient.masked_fill(held, 0.0)[:, None])[0][:, 0]
-    change = change * min(
-        1.0, SEGMENT_FIT.longest_step / float(change.abs().max().clamp_min(1e-12))
-    )
-    moved = (z + change).clamp(-SEGMENT_FIT.largest_coordinate, SEGMENT_FIT.largest_coordinate)
-    begun = [offsets + part[..., d] - part[..., :d] @ (moved - z) for part in parts.values()]
+    gradient = gradient.masked_fill(held, 0.0)
+    prior = _curvature_of_prior(gradient, z, uniform)
+    hessian = hessian + torch.diag(prior + damping * hessian.diagonal().maximum(prior))
+    change = _limited(hessian, gradient, z, uniform)
+    limit = SEGMENT_FIT.largest_coordinate
+    share = torch.special.ndtr(z)
+    quantile = (share + change * _density(z)).clamp(*_ndtr(-limit, limit))
+    is_inwards = uniform & (change * z < 0.0)
+    inwards = torch.special.ndtri(quantile) - torch.special.ndtri(share)
+    moved = (z + torch.where(is_inwards, inwards, change)).clamp(-limit, limit)
+    linear = torch.where(is_inwards, change, moved - z)
+    begun = [offsets + part[..., d] - part[..., :d] @ linear for part in parts.values()]
     return moved, torch.stack(begun)
+
+
+def as_moved(
+    now: Linearisation, z: Tensor, moved: Tensor, uniform: Tensor
+) -> tuple[Linearisation, Tensor]:
+    """Returns derivatives by the coordinates at another point, and how far away it is in those.
+
+    They are those of the same derivatives by the parameters of uniform priors.
+
+    Args:
+        now: Residuals and derivatives.
+        z: Parameters, ``(d,)``.
+        moved: Parameters at the other point, ``(d,)``.
+        uniform: Mask of coordinates with uniform priors, ``(d,)``.
+
+    Returns:
+        The derivatives, and a change of the coordinates to first order, ``(d,)``.
+    """
+    factors = torch.where(uniform, _density(moved) / _density(z), 1.0)
+    shares = (torch.special.ndtr(moved) - torch.special.ndtr(z)) / _density(moved)
+    change = torch.where(uniform, shares, moved - z)
+    return replace(now, by_parameters=now.by_parameters * factors), change
+
+
+def _curvature_of_prior(gradient: Tensor, z: Tensor, uniform: Tensor) -> Tensor:
+    """Returns the prior's part of the Hessian's diagonal, ``(d,)``.
+
+    A coordinate at the end of a uniform prior changes by hundreds where the parameter changes by a
+    little. On its way inwards it has the curvature that the parameter has in the middle.
+
+    Args:
+        gradient: The direction of descent, ``(d,)``.
+        z: Parameters, ``(d,)``.
+        uniform: Mask of coordinates with uniform priors, ``(d,)``.
+    """
+    return torch.where(uniform & (gradient * z < 0.0), (-z.square()).exp(), 1.0)
+
+
+def _limited(hessian: Tensor, gradient: Tensor, z: Tensor, uniform: Tensor) -> Tensor:
+    """Returns a step in which no parameter moves by more than ``longest_step``.
+
+    A parameter that would move by more moves by just that, and the others follow. Were the whole
+    step shortened instead, one that has almost no influence would stop all others.
+
+    Args:
+        hessian: Matrix of the normal equations, ``(d, d)``.
+        gradient: Their right-hand side, ``(d,)``.
+        z: Parameters, ``(d,)``.
+        uniform: Mask of coordinates with uniform priors, ``(d,)``. Away from the end of its prior,
+            such a parameter may move as far as from the middle.
+    """
+    longest, is_free = SEGMENT_FIT.longest_step, torch.ones_like(uniform)
+    middle, end = _ndtr(0.0, longest)
+    inwards = torch.where(uniform, ((end - middle) / _density(z)).clamp_min(longest), longest)
+    change = torch.zeros_like(gradient)
+    while bool(is_free.any()):
+        left = gradient[is_free] - hessian[is_free][:, ~is_free] @ change[~is_free]
+        change[is_free] = solve_or_zero(hessian[is_free][:, is_free], left[:, None])[0][:, 0]
+        limits = torch.where(change * z < 0.0, inwards, longest)
+        excess = (change.abs() / limits).masked_fill(~is_free, 0.0)
+        farthest = int(excess.argmax())
+        if float(excess[farthest]) <= 1.0:
+            break
+        change[farthest] = change[farthest].sign() * limits[farthest]
+        is_free[farthest] = False
+    return change
+
+
+def _density(z: Tensor) -> Tensor:
+    """Returns the density of the standard normal distribution."""
+    return (-0.5 * z.square()).exp() / math.sqrt(2.0 * math.pi)
+
+
+def _ndtr(low: float, high: float) -> tuple[float, float]:
+    """Returns probabilities of the standard normal distribution below two numbers."""
+    low, high = torch.special.ndtr(torch.tensor([low, high], dtype=torch.float64)).tolist()
+    return low, high

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.preparation.gauss_newton import possible_gain, step
+from npdr_ppl.preparation.gauss_newton import as_moved, possible_gain, step
 from npdr_ppl.preparation.linearisation import Linearisation
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import SEGMENT_FIT
@@ -270,6 +270,7 @@ def _steps(
     )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
     has_minima = bool((segments.coordinates_with_minima & ~held).any())
+    uniform = segments.uniform_coordinates
     now, model, num_updates, num_linearised = None, segments, 0, 0
     known: tuple[Tensor, Tensor, Tensor, Linearisation] | None = None
     found: tuple[float, Tensor, Tensor, Tensor] | None = None
@@ -302,12 +303,14 @@ def _steps(
                     _, z, offsets, present_scale = found
                 break
             found = present, z, offsets, present_scale
-        if not has_minima and possible_gain(now, z, offsets, held) < enough:
+        if not has_minima and possible_gain(now, z, offsets, held, uniform) < enough:
             if not num_updates:
                 break
             now = None
             continue
-        moves = [step(now, z, offsets, held, damping * f, dampings, factors) for f in factors]
+        moves = [
+            step(now, z, offsets, held, damping * f, dampings, factors, uniform) for f in factors
+        ]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
         squares = _squares(model, tried, begun, scale)  # (a, b, S, C)
@@ -336,8 +339,9 @@ def _steps(
             corrected = None
             if most_updates:
                 here = model.residuals(z[None], offsets[None], scale)[0]
-                corrected = now.rescaled(before / scale).updated(
-                    here, z - last[0], offsets - last[1]
+                followed, change = as_moved(now, last[0], z, uniform)
+                corrected = followed.rescaled(before / scale).updated(
+                    here, change, offsets - last[1]
                 )
             now = corrected
         if is_little and num_updates:

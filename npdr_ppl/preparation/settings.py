@@ -87,7 +87,8 @@ class SegmentFitSettings:
         settled_scale: Rough steps end only when the last step has kept each channel's scale at
             this share of its previous value or more.
         longest_step: Greatest change of a parameter's reference coordinate in one step, in
-            standard deviations of the prior. Initial states are not limited: on an unstable motion
+            standard deviations of the prior; away from an end of a uniform prior, the same share
+            of the range as from its middle. Initial states are not limited: on an unstable motion
             they can be wrong by many standard deviations, and each segment has its own damping.
         largest_coordinate: Greatest distance of a fit from the prior's centre, in standard
             deviations. A strength that is much smaller than typical for its half-normal prior has

@@ -174,7 +174,8 @@ def step_from(now, *, is_alone=slice(None)):
     dampings = torch.full((num,), 1e-2).double()
     held = torch.zeros(2, dtype=torch.bool)
     offsets = torch.zeros(num, 2, dtype=torch.float64)
-    return gauss_newton.step(now, START, offsets, held, 1e-2, dampings, (0.1, 1.0, 10.0))
+    factors = 0.1, 1.0, 10.0
+    return gauss_newton.step(now, START, offsets, held, 1e-2, dampings, factors, ~held)
 
 
 def test_a_segment_whose_derivatives_explode_keeps_its_start_and_holds_up_no_other():
@@ -330,6 +331,44 @@ def test_corrected_derivatives_lead_to_the_same_fit(segments, monkeypatch):
     assert abs(ends[1] - ends[0]) < 2 * SEGMENT_FIT.least_gain
 
 
+def test_a_fit_leaves_the_ends_of_uniform_priors_at_once(segments, monkeypatch):
+    """Their coordinates have hardly any influence there, and would move by hundreds."""
+    assert bool(segments.uniform_coordinates.all())
+    expected = fit_segments(segments, START)
+    places = []
+    corrected = SegmentModel.corrected
+
+    def seen(self, z, *args, **options):
+        places.append(z)
+        return corrected(self, z, *args, **options)
+
+    monkeypatch.setattr(SegmentModel, "corrected", seen)
+    found = fit_segments(segments, torch.tensor([3.5, -3.5], dtype=torch.float64))
+    assert promised(segments, found) < 2 * SEGMENT_FIT.least_gain
+    torch.testing.assert_close(found.z, expected.z, rtol=0.0, atol=0.1)
+    assert float(places[1].abs().max()) < 1.0
+
+
+def test_a_parameter_of_little_influence_stops_no_other():
+    """Both residuals are linear in the parameter, a uniform one, not in its coordinate."""
+    normal = torch.distributions.Normal(0.0, 1.0)
+    z = torch.tensor([3.5, -0.4], dtype=torch.float64)
+    truth = normal.icdf(torch.tensor([0.7, 0.6], dtype=torch.float64))
+    slopes = 1e6 * torch.tensor([[1.0, 0.3], [-0.2, 1.0]], dtype=torch.float64)
+    residual = slopes @ (normal.cdf(truth) - normal.cdf(z))
+    derivatives = slopes * normal.log_prob(z).exp()
+    now = Linearisation(residual[None], derivatives[None], torch.zeros(1, 2, 0).double())
+    none, uniform = torch.zeros(1, 0).double(), torch.ones(2, dtype=torch.bool)
+    moved, _ = gauss_newton.step(
+        now, z, none, ~uniform, 1e-6, torch.full((1,), 1e-6).double(), (1.0,), uniform
+    )
+    torch.testing.assert_close(moved, truth, rtol=0.0, atol=1e-3)
+    followed, change = gauss_newton.as_moved(now, z, moved, uniform)
+    torch.testing.assert_close(followed.by_parameters[0], slopes * normal.log_prob(moved).exp())
+    left = residual - followed.by_parameters[0] @ change
+    torch.testing.assert_close(left, slopes @ (normal.cdf(truth) - normal.cdf(moved)))
+
+
 def test_the_linearisation_of_a_fit_is_that_at_its_end(segments):
     found = fit_segments(segments, START)
     assert found.linearisation is not None
@@ -382,4 +421,5 @@ def test_the_possible_gain_is_the_greatest_that_a_linear_model_allows():
     target = torch.cat((now.residual.flatten(), -z[:2], -offsets.flatten()))
     left = target - matrix @ torch.linalg.lstsq(matrix, target[:, None]).solution[:, 0]
     expected = float(target.square().sum() - left.square().sum())
-    assert gauss_newton.possible_gain(now, z, offsets, held) == pytest.approx(expected)
+    gain = gauss_newton.possible_gain(now, z, offsets, held, torch.zeros_like(held))
+    assert gain == pytest.approx(expected)
