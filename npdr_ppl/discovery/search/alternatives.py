@@ -20,6 +20,7 @@ from npdr_ppl.discovery.search.shortlist import (
     enough_segments,
     fit_contenders,
     fit_shortlist,
+    log_evidence,
 )
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
@@ -117,9 +118,8 @@ def find_alternatives(
         return None
     release_freed_memory()
     candidates = tuple(e for e in candidates_at(without, options) if e.name != effect.name)
-    scale, num_segments = current.fit.scale, without.segments.inputs.num_segments
-    explained = float((without.losses(scale) - current.losses(scale)).sum())
-    num = enough_segments(without, current.share * explained)
+    num_segments = without.segments.inputs.num_segments
+    num = enough_segments(without, log_evidence(without, current))
     part = without
     if num < num_segments:
         part = without.along(part_of(without.segments, num))

@@ -15,7 +15,13 @@ from npdr_ppl.discovery.search.trials import Fit, Trials, refit
 from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.progress import Step
 
-__all__ = ["enough_segments", "fit_contenders", "fit_groups", "fit_shortlist"]
+__all__ = [
+    "enough_segments",
+    "fit_contenders",
+    "fit_groups",
+    "fit_shortlist",
+    "log_evidence",
+]
 
 
 def fit_shortlist(
@@ -47,7 +53,7 @@ def fit_shortlist(
         stops: Returns whether to leave out the candidates that are not fitted yet.
     """
     if ranking:
-        num = enough_segments(current, 0.5 * current.share * ranking[0].gain)
+        num = enough_segments(current, _promised(current, ranking[0].gain))
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             few, along = Trials(trials.base.along(index)), current.along(index)
@@ -142,8 +148,8 @@ def fit_groups(
 ) -> dict[str, Hypothesis]:
     """Fits the hypothesis with each of several groups of candidates, from linear estimates.
 
-    As in :func:`fit_shortlist`, a part of the segments is enough where the best group explains
-    very much.
+    As in :func:`fit_shortlist`, a part of the segments is enough where the best group, or the
+    model that they are compared with, explains very much.
 
     Args:
         trials: Fits the model.
@@ -159,7 +165,8 @@ def fit_groups(
         are left out.
     """
     if groups:
-        num = enough_segments(current, 0.5 * current.share * groups[0].gain)
+        known = log_evidence(current, compared)
+        num = enough_segments(current, max(known, _promised(current, groups[0].gain)))
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             trials = Trials(trials.base.along(index))
@@ -242,6 +249,17 @@ def enough_segments(current: Hypothesis, evidence_of_all: float) -> int:
     )
 
 
+def log_evidence(current: Hypothesis, other: Hypothesis) -> float:
+    """Returns the log evidence for another hypothesis than the current one.
+
+    Args:
+        current: The current one.
+        other: The other one, along the same segments. The noise is what it leaves.
+    """
+    scale = other.fit.scale
+    return other.share * float((current.losses(scale) - other.losses(scale)).sum())
+
+
 def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
     """Returns the initial guesses of a candidate's fits.
 
@@ -268,9 +286,20 @@ def _best(trials: Sequence[Hypothesis]) -> Hypothesis:
 
 def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
     """Returns the share of the best trial's gain that another must reach to be an alternative."""
-    scale = best.fit.scale
-    explained = best.share * float((current.losses(scale) - best.losses(scale)).sum())
-    return 1.0 - TRIALS.certain_evidence / max(explained, TRIALS.certain_evidence)
+    return 1.0 - TRIALS.certain_evidence / max(
+        log_evidence(current, best), TRIALS.certain_evidence
+    )
+
+
+def _promised(current: Hypothesis, gain: float) -> float:
+    """Returns the log evidence for a candidate to first order, with the noise that it leaves.
+
+    Args:
+        current: The model without it.
+        gain: Its linear gain, in units of the variance that the model leaves.
+    """
+    num = float(current.segments.num_measured.sum())
+    return -0.5 * current.share * num * math.log(max(1.0 - gain / num, 1e-9))
 
 
 def _shown(hypothesis: Hypothesis) -> str:
