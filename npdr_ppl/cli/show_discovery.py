@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from npdr_ppl.cli.printing import console_for_tables, percent, print_notes, print_reason
+from npdr_ppl.drawing.effect_names import why_unnamed
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["show_discovery"]
@@ -69,14 +70,13 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             for constant, value in row.get("constants", {}).items():
                 table.add_row("", escape(constant), "", f"{value:.4g}", "", "")
         console.print(table)
-        minor = [f"{e['port']}.{e['effect']}" for e in found["effects"] if e.get("is_minor")]
+        unnamed = [(f"{e['port']}.{e['effect']}", why_unnamed(e)) for e in found["effects"]]
+        minor = [name for name, why in unnamed if why == "small"]
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
-        for effect in found["effects"]:
-            if effect.get("corrects"):
-                name = f"{effect['port']}.{effect['effect']}"
-                told = f"{name} corrects {effect['corrects']} of the model, and is not named."
-                console.print(escape(told), highlight=False)
+        for name, why in unnamed:
+            if why.startswith("corrects"):
+                console.print(escape(f"{name} is not missing: it {why}."), highlight=False)
         uncompared = [
             f"{e['port']}.{e['effect']}" for e in found["effects"] if e["probability"] is None
         ]

@@ -69,7 +69,7 @@ def finding_of(
         if (site := f"{effect.name}.{p.name}") in every
     ]
     is_zero = bool(sizes) and max(sizes) < VERDICT.fewest_deviations
-    whole = sum(other.share for other in search.added)
+    whole = sum(other.share for other in search.missing)
     is_small = search.is_approximate and added.share <= VERDICT.minor_share * whole
     alternatives = [
         name
@@ -92,9 +92,9 @@ def finding_of(
             if site in every
         },
         at_edge,
-        is_zero or is_small,
-        search.final.simulator.corrected_number(effect),
-        repetition,
-        tuple(found_in),
-        added.is_compared,
+        is_minor=is_zero or is_small,
+        corrects=search.final.simulator.corrected_number(effect),
+        repetition=repetition,
+        found_in=tuple(found_in),
+        is_compared=added.is_compared,
     )

@@ -227,7 +227,7 @@ class Investigation:
     def _at_edge(self) -> list[tuple[str, ...]]:
         """For each effect, the shape parameters that have, or may have, an implausible value."""
         search = self.search
-        final, explains = search.final, sum(added.share for added in search.added)
+        final, explains = search.final, sum(added.share for added in search.missing)
         result = []
         with self.progress.timed("limits"):
             for added in search.added:

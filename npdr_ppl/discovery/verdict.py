@@ -45,7 +45,11 @@ def judge(
             f"The effects that were found leave {unexplained:.0%} of the misfit unexplained. "
             f"The strongest sign of it is {left.strongest}."
         )
-    explains = sum(f.share for f in effects)
+    missing = [f for f in effects if not f.corrects]
+    if not missing:
+        numbers = ", ".join(f.corrects for f in effects)
+        return "none", f"No effect is missing. The recording corrects {numbers}."
+    explains = sum(f.share for f in missing)
     strained = [f for f in effects if f.at_edge and f.share > VERDICT.minor_share * explains]
     if strained:
         return "unknown", (
@@ -69,7 +73,7 @@ def judge(
             return "unknown", _still_open(sure, gap["rmse"])
         return "named", "Missing: " + ", ".join(f.effect.name for f in sure) + "."
     if not unsure:
-        names = ", ".join(f.effect.name for f in effects)
+        names = ", ".join(f.effect.name for f in missing)
         return "unknown", f"The effects that were found are too small to be named: {names}."
     unclear = most_doubtful(effects, options)
     likeliest = sorted(unclear.alternatives.values(), reverse=True)

@@ -67,7 +67,7 @@ _SHARES = ("error", "skew")
 
 
 def why_unnamed(effect: Mapping[str, Any]) -> str:
-    """Returns in a word or two why an effect of the revised model is not named; empty if it is.
+    """Returns in a few words why an effect of the revised model is not named; empty for others.
 
     Args:
         effect: The effect in ``discovery.json``.

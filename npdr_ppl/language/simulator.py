@@ -122,11 +122,11 @@ class Simulator(ABC):
         return any(port.name == action and port.kind == "servo" for port in self.ports)
 
     def corrected_number(self, effect: Effect) -> str:
-        """Returns the number of the model that may be wrong and that an effect would correct.
+        """Returns the uncertain number of the model that an effect would correct; empty if none.
 
-        It is no parameter, because recordings do not determine it beside the parameters, unless
-        another effect is added. A correction is no missing effect, and can have either sign.
-        Empty if there is none.
+        Recordings do not determine this number beside the parameters, so it is not a parameter
+        itself. Another effect can make it determinable. A correction is no missing effect, and
+        can have either sign.
 
         Args:
             effect: An effect that can be attached.

@@ -300,6 +300,9 @@ def _cause(
     """Returns a stored cause of a model; ``laws`` are the learned formulas by effect."""
     effects = [_effect(described, run, laws) for described in part["effects"]]
     for effect in effects:
+        simulator = only_simulator(model)[0].simulator
+        if simulator.corrected_number(effect):
+            effect = effect.of_either_sign(simulator.port(effect.port))
         model = add_effect(model, effect)
     try:
         prior = prior_of(model, time_step)

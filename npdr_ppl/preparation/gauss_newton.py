@@ -122,7 +122,7 @@ def step(
     hessian = hessian + torch.diag(prior + damping * hessian.diagonal().maximum(prior))
     change = _limited(hessian, gradient, z, uniform)
     limit = SEGMENT_FIT.largest_coordinate
-    share = torch.special.ndtr(z)
+    share = torch.special.ndtr(z.clamp(-limit, limit))
     quantile = (share + change * _density(z)).clamp(*_ndtr(-limit, limit))
     is_inwards = uniform & (change * z < 0.0)
     inwards = torch.special.ndtri(quantile) - torch.special.ndtri(share)
@@ -135,9 +135,10 @@ def step(
 def as_moved(
     now: Linearisation, z: Tensor, moved: Tensor, uniform: Tensor
 ) -> tuple[Linearisation, Tensor]:
-    """Returns derivatives by the coordinates at another point, and how far away it is in those.
+    """Returns derivatives at another point, if residuals are linear in uniform parameters.
 
-    They are those of the same derivatives by the parameters of uniform priors.
+    Their coordinates are not linear in the parameters, so derivatives by them differ from point
+    to point.
 
     Args:
         now: Residuals and derivatives.
@@ -146,7 +147,8 @@ def as_moved(
         uniform: Mask of coordinates with uniform priors, ``(d,)``.
 
     Returns:
-        The derivatives, and a change of the coordinates to first order, ``(d,)``.
+        The derivatives by the coordinates at the other point, and the change of the parameters in
+        these, to first order, ``(d,)``.
     """
     factors = torch.where(uniform, _density(moved) / _density(z), 1.0)
     shares = (torch.special.ndtr(moved) - torch.special.ndtr(z)) / _density(moved)
@@ -157,15 +159,19 @@ def as_moved(
 def _curvature_of_prior(gradient: Tensor, z: Tensor, uniform: Tensor) -> Tensor:
     """Returns the prior's part of the Hessian's diagonal, ``(d,)``.
 
-    A coordinate at the end of a uniform prior changes by hundreds where the parameter changes by a
-    little. On its way inwards it has the curvature that the parameter has in the middle.
+    The objective has the square of each coordinate. A coordinate at the end of a uniform prior
+    changes by hundreds where the parameter changes by a little. So where the data pull it inwards,
+    its curvature is that of a normal prior of the parameter, as wide as in the middle. Where
+    they pull it outwards, against the prior, the curvature of the objective counts.
 
     Args:
-        gradient: The direction of descent, ``(d,)``.
+        gradient: The direction of descent, data and prior together, ``(d,)``.
         z: Parameters, ``(d,)``.
         uniform: Mask of coordinates with uniform priors, ``(d,)``.
     """
-    return torch.where(uniform & (gradient * z < 0.0), (-z.square()).exp(), 1.0)
+    by_data = (gradient + z) * z
+    inwards, outwards = (-z.square()).exp(), 1.0 + by_data.clamp_min(0.0)
+    return torch.where(uniform, torch.where(by_data < 0.0, inwards, outwards), 1.0)
 
 
 def _limited(hessian: Tensor, gradient: Tensor, z: Tensor, uniform: Tensor) -> Tensor:
@@ -183,7 +189,7 @@ def _limited(hessian: Tensor, gradient: Tensor, z: Tensor, uniform: Tensor) -> T
     """
     longest, is_free = SEGMENT_FIT.longest_step, torch.ones_like(uniform)
     middle, end = _ndtr(0.0, longest)
-    inwards = torch.where(uniform, ((end - middle) / _density(z)).clamp_min(longest), longest)
+    inwards = torch.where(uniform, (end - middle) / _density(z), longest)
     change = torch.zeros_like(gradient)
     while bool(is_free.any()):
         left = gradient[is_free] - hessian[is_free][:, ~is_free] @ change[~is_free]

@@ -38,6 +38,16 @@ def test_a_certain_effect_that_explains_everything_is_named(judge, drag):
     assert judge() == ("named", "Missing: hinge.quadratic_drag.")
 
 
+def test_a_correction_is_not_missing_and_takes_no_share(judge, drag):
+    correction = replace(drag, corrects="joint hinge damping", share=50.0 * drag.share)
+    verdict, reason = judge(effects=[correction])
+    assert verdict == "none"
+    assert reason == "No effect is missing. The recording corrects joint hinge damping."
+    assert judge(effects=[correction, drag]) == ("named", "Missing: hinge.quadratic_drag.")
+    doubtful = replace(drag, probability=0.5, share=0.5 * drag.share)
+    assert judge(effects=[correction, drag, doubtful])[0] == "ambiguous"
+
+
 def test_without_effects_only_the_alarm_decides(judge):
     assert judge(effects=[], p_value=0.5)[0] == "none"
     verdict, reason = judge(effects=[], p_value=1e-3)

@@ -271,12 +271,17 @@ def test_errors_name_what_exists(options, message):
 
 
 def test_viscous_friction_corrects_damping_that_is_held():
-    simulator = arm(held=["joint elbow damping", "body hand mass"])
+    simulator = arm(held=["joint elb* damping", "body hand mass"])
+    inputs = random_inputs(simulator)
     ports = [port.name for port in simulator.ports if port.kind == "force"]
     elbow, shoulder = (next(p for p in ports if p.startswith(n)) for n in ("elbow", "shoulder"))
     assert simulator.corrected_number(ViscousFriction(elbow)) == "joint elbow damping"
     assert simulator.corrected_number(ViscousFriction(shoulder)) == ""
     assert simulator.corrected_number(CoulombFriction(elbow)) == ""
+    # The sum is never negative.
+    damped = simulator.with_effects(ViscousFriction(elbow))
+    less = damped.simulate({f"{elbow}.viscous_friction.damping": value([-9.0, -8.0, 0.0])}, inputs)
+    assert torch.equal(less[0], less[1]) and not torch.equal(less[1], less[2])
     every = simulator.with_effects(CoulombFriction(elbow)).with_finer_steps()
     assert every.corrected_number(ViscousFriction(elbow)) == "joint elbow damping"
 

@@ -174,8 +174,8 @@ def step_from(now, *, is_alone=slice(None)):
     dampings = torch.full((num,), 1e-2).double()
     held = torch.zeros(2, dtype=torch.bool)
     offsets = torch.zeros(num, 2, dtype=torch.float64)
-    factors = 0.1, 1.0, 10.0
-    return gauss_newton.step(now, START, offsets, held, 1e-2, dampings, factors, ~held)
+    factors, uniform = (0.1, 1.0, 10.0), torch.ones(2, dtype=torch.bool)
+    return gauss_newton.step(now, START, offsets, held, 1e-2, dampings, factors, uniform)
 
 
 def test_a_segment_whose_derivatives_explode_keeps_its_start_and_holds_up_no_other():
@@ -343,10 +343,29 @@ def test_a_fit_leaves_the_ends_of_uniform_priors_at_once(segments, monkeypatch):
         return corrected(self, z, *args, **options)
 
     monkeypatch.setattr(SegmentModel, "corrected", seen)
-    found = fit_segments(segments, torch.tensor([3.5, -3.5], dtype=torch.float64))
+    found = fit_segments(segments, torch.tensor([0.0, 3.5], dtype=torch.float64))
     assert promised(segments, found) < 2 * SEGMENT_FIT.least_gain
     torch.testing.assert_close(found.z, expected.z, rtol=0.0, atol=0.1)
-    assert float(places[1].abs().max()) < 1.0
+    assert abs(float(places[1][1])) < 0.6
+
+
+@pytest.mark.parametrize("begun", [(4.5, 0.0), (0.0, 0.0), (-3.0, 1.0)])
+def test_a_fit_ends_where_data_and_prior_balance_at_an_end(recording, begun):
+    """The data ask for a mass beyond the end of its prior."""
+
+    def model(inputs):
+        mass = pyro.sample("mass", dist.Uniform(0.3, 0.97))
+        length = pyro.sample("length", dist.Uniform(0.3, 1.7))
+        return npdr.simulate("trajectory", Pendulum(), {"mass": mass, "length": length}, inputs)
+
+    segments = SegmentModel(model, recording, OPTIONS)
+    found = fit_segments(segments, torch.tensor(begun, dtype=torch.float64))
+    assert float(found.z[0]) > 1.0
+    least = objective(segments, found.z, found.offsets, found.scale)
+    for coordinate in torch.linspace(-1.0, 5.0, 61, dtype=torch.float64):
+        z = torch.stack((coordinate, found.z[1]))
+        gain = least - objective(segments, z, found.offsets, found.scale)
+        assert gain < 4 * SEGMENT_FIT.least_gain
 
 
 def test_a_parameter_of_little_influence_stops_no_other():

@@ -69,6 +69,12 @@ class Search:
     is_approximate: bool = False
     has_stopped: bool = False
 
+    @property
+    def missing(self) -> list[Added]:
+        """Its effects, without those that correct a number of the model."""
+        simulator = self.final.simulator
+        return [each for each in self.added if not simulator.corrected_number(each.effect)]
+
 
 def explained(first: Hypothesis, final: Hypothesis) -> float:
     """Returns the reduction of the misfit, in units of the measurements' variance."""

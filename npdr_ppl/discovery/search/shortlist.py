@@ -165,13 +165,16 @@ def fit_groups(
         are left out.
     """
     if groups:
-        known = log_evidence(current, compared)
-        num = enough_segments(current, max(known, _promised(current, groups[0].gain)))
+        evidence_of_all = _promised(current, groups[0].gain)
+        # Losses can be compared only with the same initial states.
+        is_same = compared.segments.starts is current.segments.starts
+        if is_same:
+            evidence_of_all = max(evidence_of_all, log_evidence(current, compared))
+        num = enough_segments(current, evidence_of_all)
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             trials = Trials(trials.base.along(index))
             # The same object, so that fits begin at the fitted offsets.
-            is_same = compared.segments.starts is current.segments.starts
             current = current.along(index)
             compared = current if is_same else compared.along(index)
     starts = compared.segments.starts
@@ -292,7 +295,10 @@ def _far_behind(current: Hypothesis, best: Hypothesis) -> float:
 
 
 def _promised(current: Hypothesis, gain: float) -> float:
-    """Returns the log evidence for a candidate to first order, with the noise that it leaves.
+    """Returns the log evidence for a candidate to first order, with the noise estimated anew.
+
+    It is far less than :func:`log_evidence` of the fit if the candidate explains nearly all: how
+    little it leaves is not known before.
 
     Args:
         current: The model without it.

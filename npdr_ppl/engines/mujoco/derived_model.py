@@ -162,7 +162,7 @@ class DerivedModel:
         ]
         held = [f"    {_quoted(field)}: {_quoted(self.reason(field))}," for field in self.held]
         if held:
-            title = "# Not varied, because positions do not determine them beside these."
+            title = "# Not varied, because positions do not determine them beside the parameters."
             held = ["", title, "HELD = {", *held, "}"]
         has_logarithms = any(p.family == "log-normal" for p in self.parameters)
         return _TEMPLATE.format(

@@ -389,15 +389,14 @@ class MujocoMechanism(ClosedLoopSimulator):
 
     def _ports_with_held_damping(self, held: Iterable[str]) -> dict[str, str]:
         """Returns the held fields that are joints' damping, by the joint's force port."""
-        fields = {text: find_field(self.model, text) for text in held}
-        texts = {
-            entry.place: text
-            for text, field in fields.items()
-            for entry in field.entries
-            if entry.array == "dof_damping"
+        fields = [find_field(self.model, text) for text in held]
+        dofs = {e.place for field in fields for e in field.entries if e.array == "dof_damping"}
+        names = element_names(self.model, "joint")
+        return {
+            port.port.name: f"joint {names[port.joint]} damping"
+            for port in self.force_ports
+            if port.velocity in dofs
         }
-        ports = self.force_ports
-        return {p.port.name: texts[p.velocity] for p in ports if p.velocity in texts}
 
     def _initial_positions(self, keyframe: str | None) -> Any:
         """Returns the qpos of components that are not states."""

@@ -63,7 +63,9 @@ def native_law(
     """
     if effect.standard_law == "damping":
         key = "dof_damping", port.velocity
-        return {key: present(model, *key, assignments) + values["damping"]}
+        # Negative damping would drive the joint.
+        total = present(model, *key, assignments) + values["damping"]
+        return {key: total.clamp_min(0.0)}
     return {
         ("jnt_stiffness", port.joint): values["stiffness"],
         ("qpos_spring", port.position): values["rest"],

@@ -77,9 +77,9 @@ class MujocoSimulator(MujocoMechanism):
         substeps: Engine steps per step; ``None`` to compute it from the file's time step.
         num_threads: Threads; ``None`` for as many as torch uses.
         keyframe: The file's keyframe with the pose of components that are not states.
-        held: Fields that may be wrong, but are no parameters because positions do not determine
-            them beside these. Where an added effect changes that, discovery corrects damping of
-            joints, which it does not call a missing effect.
+        held: Fields whose value is uncertain, but which positions do not determine beside the
+            parameters. An added effect can make the damping of a joint determinable. Discovery
+            then corrects it, and does not call this a missing effect.
 
     Attributes:
         model: The ``mujoco.MjModel``.
