@@ -45,7 +45,9 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
     verdicts = {
         "none": (
             "No effect is missing",
-            f"The present model explains the recording (alarm: p = {p_value}).",
+            reason
+            if effects
+            else f"The present model explains the recording (alarm: p = {p_value}).",
         ),
         "named": (f"Missing: {_listed(labels) or 'an effect'}", gained),
         "ambiguous": (

@@ -23,6 +23,9 @@ def test_corrections_and_small_effects_are_not_in_the_headline():
     result["effects"][1]["corrects"] = "joint hinge damping"
     result["effects"][2]["is_minor"] = True
     assert headline(result)[0] == "Missing: hinge force limit"
+    reason = "No effect is missing. The recording corrects joint hinge damping."
+    result |= {"verdict": "none", "effects": [result["effects"][1]], "reason": reason}
+    assert headline(result) == ("No effect is missing", reason)
 
 
 @pytest.mark.parametrize(
