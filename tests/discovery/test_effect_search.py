@@ -1,5 +1,6 @@
 """Candidates that are tried in a round, and the alternatives to each effect."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -86,7 +87,9 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))
     ranking = searcher.look(base).ranking
     whole = base.segments.inputs.num_segments
-    evidence = 0.5 * base.share * ranking[0].gain
+    # The likelihood with the variance of what is left, before and after.
+    num = float(base.segments.num_measured.sum())
+    evidence = 0.5 * base.share * num * math.log(num / (num - ranking[0].gain))
 
     def with_enough(evidence):
         settings = replace(shortlist.TRIALS, enough_evidence=evidence, fewest_segments=3)
