@@ -70,13 +70,15 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             for constant, value in row.get("constants", {}).items():
                 table.add_row("", escape(constant), "", f"{value:.4g}", "", "")
         console.print(table)
-        unnamed = [(f"{e['port']}.{e['effect']}", why_unnamed(e)) for e in found["effects"]]
-        minor = [name for name, why in unnamed if why == "small"]
+        names = [f"{e['port']}.{e['effect']}" for e in found["effects"]]
+        labelled = list(zip(names, found["effects"], strict=True))
+        minor = [name for name, effect in labelled if why_unnamed(effect) == "small"]
         if minor:
             console.print(f"Too small to be named, but in the model: {escape(', '.join(minor))}.")
-        for name, why in unnamed:
-            if why.startswith("corrects"):
-                console.print(escape(f"{name} is not missing: it {why}."), highlight=False)
+        for name, effect in labelled:
+            if effect.get("corrects"):
+                told = f"{name} is not missing: it {why_unnamed(effect)}."
+                console.print(escape(told), highlight=False)
         uncompared = [
             f"{e['port']}.{e['effect']}" for e in found["effects"] if e["probability"] is None
         ]

@@ -270,7 +270,7 @@ def _steps(
     )
     factors, present_scale = SEGMENT_FIT.near_factors, scale
     has_minima = bool((segments.coordinates_with_minima & ~held).any())
-    uniform = segments.uniform_coordinates
+    uniform = segments.prior.uniform_coordinates
     now, model, num_updates, num_linearised = None, segments, 0, 0
     known: tuple[Tensor, Tensor, Tensor, Linearisation] | None = None
     found: tuple[float, Tensor, Tensor, Tensor] | None = None

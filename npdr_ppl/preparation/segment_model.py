@@ -295,11 +295,6 @@ class SegmentModel:
                 masked[site.coordinates] = True
         return masked
 
-    @property
-    def uniform_coordinates(self) -> Tensor:
-        """Mask ``(d,)`` of the coordinates of parameters with uniform priors."""
-        return self.prior.uniform_coordinates
-
     def place_of(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns reference coordinates from which a fit may begin, ``(d,)``.
 

@@ -87,7 +87,7 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=effects))
     ranking = searcher.look(base).ranking
     whole = base.segments.inputs.num_segments
-    # The likelihood with the variance of what is left, before and after.
+    # Each independent measurement gives half of the fall of the log variance.
     num = float(base.segments.num_measured.sum())
     evidence = 0.5 * base.share * num * math.log(num / (num - ranking[0].gain))
 

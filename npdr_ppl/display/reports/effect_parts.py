@@ -41,12 +41,13 @@ def effects_section(effects: Rows, ranking: Rows) -> Section:
         for effect in effects
     ]
     columns = ("effect", "probability", "share of the misfit", "could also be")
-    reasons = [why_unnamed(effect) for effect in effects]
     captions = {
-        "Small effects are in the revised model, but are not named.": "small" in reasons,
-        "An effect that corrects a number of the model is not missing. It was no parameter, "
-        "because recordings determine it only together with the other effects.": any(
-            why.startswith("corrects") for why in reasons
+        "Small effects are in the revised model, but are not named.": any(
+            why_unnamed(effect) == "small" for effect in effects
+        ),
+        "An effect that corrects a number of the model is not missing. That number was no "
+        "parameter, because recordings determine it only together with the other effects.": any(
+            effect.get("corrects") for effect in effects
         ),
     }
     caption = " ".join(text for text, is_needed in captions.items() if is_needed)
