@@ -24,11 +24,13 @@ from npdr_ppl.models.effects import (
     InputDelay,
     IntegralAction,
     Saturation,
+    SensorDelay,
     ServoDeadBand,
     ServoForceLimit,
     candidate_effects,
 )
 from npdr_ppl.policies.playback import Playback
+from tests.helpers.effect_replay import replay
 from tests.helpers.mujoco_files import random_inputs, value
 
 STEP, GAIN, DAMPING = 0.002, 20.0, 1.0
@@ -36,8 +38,8 @@ STEP, GAIN, DAMPING = 0.002, 20.0, 1.0
 SERVO = '<position name="goal" joint="hinge" kp="{kp}" kv="{kv}" {more}/>'
 
 
-def joint(actuator=SERVO, more=""):
-    actuator = actuator.format(kp=GAIN, kv=DAMPING, more=more)
+def joint(actuator=SERVO, more="", kp=GAIN, kv=DAMPING):
+    actuator = actuator.format(kp=kp, kv=kv, more=more)
     text = f"""<mujoco><option timestep="{STEP}"/><worldbody>
     <body><joint name="hinge" axis="0 1 0" armature="0.02" range="-120 120"/>
     <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/></body></worldbody>
@@ -326,6 +328,22 @@ def test_a_coarse_goal_is_a_multiple_of_its_step():
     assert torch.equal(out[0], joint().simulate({}, goals(commands)))
     rounded = 0.07 * np.round(commands / 0.07)
     torch.testing.assert_close(out[1], joint().simulate({}, goals(rounded)))
+
+
+def test_late_sensors_of_a_servo_that_damps_within_a_step_start_where_the_joint_is():
+    """Its motion decays at 1700 per second: explicit steps of 2 ms would blow it up."""
+    simulator = joint(kp=1000.0, kv=100.0).with_finer_steps()
+    late = simulator.with_effects(SensorDelay("hinge,hinge_velocity"))
+    given = {"hinge,hinge_velocity.sensor_delay.delay": 0.0107}
+    begin, num = 60, 40
+    time = STEP * torch.arange(begin + num, dtype=torch.float64)
+    commands = 0.3 * torch.sin(5.0 * time) + 0.1 * torch.sign(torch.sin(23.0 * time))
+    whole = replay(late, given, commands)
+    start = whole[begin - 1].tolist()
+    out = replay(late, given, commands[begin:], start, begin, commands[None, :begin, None])
+    assert (whole[-1] - whole[begin]).abs().max() > 0.1
+    error = (out - whole[begin:]).abs()
+    assert error[:, 0].max() < 3e-5 and error[:, 1].max() < 0.03 * whole[begin:, 1].abs().max()
 
 
 def test_laws_of_goals_need_a_servo_that_follows_its_joint():

@@ -1,7 +1,7 @@
 """Applies effects before, during and after a step, for every engine."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -11,7 +11,7 @@ from npdr_ppl.engines.common.chain_state import Moments, State, Tables
 from npdr_ppl.engines.common.compilation import signature
 from npdr_ppl.engines.common.force_effects import ForceEffects
 from npdr_ppl.engines.common.integrators import Components
-from npdr_ppl.engines.common.measurement_times import earlier_changes
+from npdr_ppl.engines.common.measurement_times import changes_since, earlier_changes
 from npdr_ppl.engines.common.past_motion import PastMotion
 from npdr_ppl.engines.common.sensor_effects import SensorEffects
 from npdr_ppl.language.effects import ActionEffect, Commands, Effect, SensorEffect
@@ -81,6 +81,14 @@ class EffectChain(ABC):
         return tuple(name if joint in joints else None for joint, name in enumerate(names))
 
     @property
+    def num_parts(self) -> int:
+        """In how many parts of a step late measurements are moved to the present.
+
+        They must be so short that the fastest damping is followed.
+        """
+        return 1
+
+    @property
     def signature(self) -> Hashable:
         """Equal for chains that compile to the same code."""
         return signature(self.simulator), self.time_step, self.histories
@@ -146,6 +154,7 @@ class EffectChain(ABC):
         num_past: int = 0,
         past_motion: PastMotion | None = None,
         is_held: Tensor | None = None,
+        earlier: Sequence[Components] = (),
     ) -> State:
         """Returns the state at the start of an episode or segment.
 
@@ -164,8 +173,10 @@ class EffectChain(ABC):
                 effects.
             past_motion: Motion of the joints before the start; ``None`` if it is unknown.
             is_held: Where the robot did not move before, ``(N,)``; ``None`` for nowhere.
+            earlier: Positions, then velocities one step before, two steps before and so on, as far
+                as late measurements need them; empty to compute them from those at the start.
         """
-        earlier = time - num_past * self.time_step
+        begun = time - num_past * self.time_step
         joint_positions, joint_velocities = positions, velocities
         if self.forces.effects:
             joint_positions, joint_velocities = self.at_joints(positions, velocities)
@@ -175,7 +186,7 @@ class EffectChain(ABC):
             self.forces.initial_memory(
                 joint_positions, joint_velocities, tables, time, past_motion or PastMotion()
             ),
-            self.actions.initial_memory(commands, tables, earlier),
+            self.actions.initial_memory(commands, tables, begun),
             self.actions.initial_past(commands),
             *self._sensor_memory(
                 positions,
@@ -185,6 +196,7 @@ class EffectChain(ABC):
                 readings,
                 time,
                 is_held,
+                earlier,
             ),
         )
 
@@ -197,6 +209,7 @@ class EffectChain(ABC):
         readings: tuple[Tensor | None, ...],
         time: Tensor,
         is_held: Tensor | None,
+        earlier: Sequence[Components],
     ) -> tuple[tuple[tuple[Any, ...], ...], tuple[Components, ...]]:
         """Returns the sensor effects' own state, and past values; see :meth:`start`."""
         # Only values that an effect needs are computed, because short simulations start often.
@@ -212,9 +225,12 @@ class EffectChain(ABC):
                 return self.accelerations(states[:split], states[split:], commands, tables)
 
             states = (*positions, *velocities)
-            changes = earlier_changes(
-                self.simulator, states, accelerations, self.time_step, num_before
-            )
+            if earlier:
+                changes = changes_since(self.simulator, states, earlier, num_before)
+            else:
+                changes = earlier_changes(
+                    self.simulator, states, accelerations, self.time_step, num_before
+                )
             if is_held is not None:
                 changes = {
                     column: tuple(change.where(~is_held, 0.0) for change in own)

@@ -17,6 +17,7 @@ from npdr_ppl.language.simulator import Simulator
 
 __all__ = [
     "RecordedStart",
+    "TrueStart",
     "after_past_commands",
     "recorded_start",
     "true_start",
@@ -53,6 +54,20 @@ class RecordedStart(NamedTuple):
             self.is_recorded,
             self.is_held[first:last],
         )
+
+
+class TrueStart(NamedTuple):
+    """The true state at the start of the segments; components of the flat batch shape ``(N,)``.
+
+    Attributes:
+        states: The state.
+        earlier: The state one step before, two steps before and so on, as far as late measurements
+            reach back. Components that are measured in time are those of the start. Empty if
+            positions and their rates are not equally late.
+    """
+
+    states: Components
+    earlier: tuple[Components, ...]
 
 
 def recorded_start(simulator: Simulator, inputs: Inputs, shape: torch.Size) -> RecordedStart:
@@ -116,7 +131,7 @@ def true_start(
     tables: Tables,
     recorded: RecordedStart,
     records: Sequence[CommandRecord],
-) -> Components:
+) -> TrueStart:
     """Returns the true state, computed from recorded values by removing the sensor effects.
 
     A velocity that was derived from position measurements has the scale and timing of the position
@@ -130,7 +145,7 @@ def true_start(
         records: Commands of each action channel.
     """
     if not chain.sensors.effects:
-        return recorded.states
+        return TrueStart(recorded.states, (recorded.states,))
     states = chain.simulator.states
     places = {state.name: i for i, state in enumerate(states)}
     sensors = {sensor.name: i for i, sensor in enumerate(chain.simulator.sensors)}
@@ -154,7 +169,7 @@ def true_start(
     leads = sensor_leads(chain.sensors.effects, tables.effects, recorded.time)
     leads = {column: lead.where(~recorded.is_held, 0.0) for column, lead in leads.items()}
     if not leads:
-        return tuple(true)
+        return TrueStart(tuple(true), (tuple(true),))
     sources = (
         sensors.get((state.rate_of or "") if is_derived else state.name)
         for state, is_derived in zip(states, recorded.is_derived, strict=True)
@@ -166,7 +181,10 @@ def true_start(
         commands = commands_at(records, step)
         return chain.accelerations(states[:split], states[split:], commands, tables)
 
-    return catch_up(chain.simulator, tuple(true), accelerations, late, chain.time_step)
+    parts = chain.num_parts
+    return TrueStart(
+        *catch_up(chain.simulator, tuple(true), accelerations, late, chain.time_step, parts)
+    )
 
 
 def with_past_commands(

@@ -95,7 +95,7 @@ class Signals:
         Offsets and scale errors of sensors are removed from the measurements.
         """
         tables = Tables(None, self._sensor_parameters)
-        components = true_start(self._sensor_chain, tables, self._recorded, ())
+        components = true_start(self._sensor_chain, tables, self._recorded, ()).states
         if not components:
             return torch.zeros(len(self.start_times), 0, dtype=torch.float64)
         return torch.stack(components, dim=-1)

@@ -122,7 +122,7 @@ class _Replay:
             batch, tables = self.simulator.make_batch(given, last - first, step, middle)
             chain = MujocoStepper(self.simulator, batch, step, self.histories)
             records = self._records(chain, first, last)
-            components = true_start(chain, tables, recorded, records)
+            components, earlier = true_start(chain, tables, recorded, records)
             past = self._num_past(chain)
             chain.place(components)
             chain.begin()
@@ -137,6 +137,7 @@ class _Replay:
                 num_past=past,
                 past_motion=self._past_motion(chain).part(first, last),
                 is_held=recorded.is_held,
+                earlier=earlier,
             )
             servo_memory = with_recorded_past(
                 self.simulator,

@@ -203,10 +203,10 @@ def _start(
             f"states, got {len(recorded.states)}."
         )
     past = stepper.actions.num_past_steps(inputs.past_actions.shape[-2])
-    components = true_start(stepper, tables, recorded, records)
+    true = true_start(stepper, tables, recorded, records)
     state = stepper.start(
-        components[:num_joints],
-        components[num_joints:],
+        true.states[:num_joints],
+        true.states[num_joints:],
         tables,
         commands_at(records, -1 - past),
         recorded.readings,
@@ -215,5 +215,6 @@ def _start(
         num_past=past,
         past_motion=past_motion(inputs, stepper.channels_with_past, shape, recorded.time.dtype),
         is_held=recorded.is_held,
+        earlier=true.earlier,
     )
     return with_past_commands(stepper, state, tables, records, past)
