@@ -122,7 +122,7 @@ def test_what_was_hopeless_in_coarse_steps_is_not_fitted_again(dragged):
     looked = searcher.look(searcher.fit_base())
     weights = {"": 0.0, "hinge.bias": 1e-200, "hinge.cogging": 0.3}
     coarse = replace(looked, weights=weights, hopeless=frozenset({"hinge.spring"}))
-    again = searcher._in_present_steps(coarse)
+    again = searcher._begun_again(coarse)
     assert again.hopeless == {"", "hinge.bias", "hinge.spring"}
     assert again.hypothesis is not looked.hypothesis
     assert not again.weights

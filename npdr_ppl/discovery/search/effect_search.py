@@ -109,9 +109,10 @@ class Searcher(OriginalModel):
                 break
             tested = best if extended is single else None
             current = self.trials.with_own_starts(self._pruned(extended, tested))
-            if self._refines_steps(current, rounds[-1]):
-                # The missing effect had hidden that the steps are too coarse.
-                first = now = self._in_present_steps(rounds[0])
+            if self._changes_model(current, rounds[-1]):
+                # The missing effect had hidden that the steps are too coarse, or that the model's
+                # own priors suffice.
+                first = now = self._begun_again(rounds[0])
                 current, rounds = first.hypothesis, [first]
                 continue
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
@@ -120,18 +121,19 @@ class Searcher(OriginalModel):
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
 
-    def _refines_steps(self, current: Hypothesis, now: Round) -> bool:
-        """Takes finer integration steps if the present ones are too coarse for a model or a rival.
+    def _changes_model(self, current: Hypothesis, now: Round) -> bool:
+        """Takes finer steps if the present ones are too coarse, or own priors if they suffice.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
-        measurement does not: in coarse steps, the wrong one of the two can fit better.
+        measurement does not: in coarse steps, the wrong one of the two can fit better. So can the
+        wrong one with wide priors. Both are therefore decided by the likeliest rivals, too.
 
         Args:
             current: The model with the effects that were added.
             now: The round that added the last one, with what it tried.
 
         Returns:
-            Whether they were refined.
+            Whether steps or priors were changed.
         """
         if self._deadline.stops():
             return False
@@ -139,15 +141,19 @@ class Searcher(OriginalModel):
         # Others were not fitted to convergence, and would gain by that alone.
         rivals = [now.trials[name] for name in likeliest[: TRIALS.most_converged]]
         rivals = [trial for trial in rivals if set(trial.names) != set(current.names)]
-        return any(self.with_finer_steps(model) is not model for model in (current, *rivals))
+        models = [current, *rivals]
+        if any(self.with_finer_steps(model) is not model for model in models):
+            return True
+        # Without an effect, nothing has taken the place of the wider priors.
+        return bool(current.effects) and self.takes_own_priors(models)
 
-    def _in_present_steps(self, first: Round) -> Round:
-        """Returns the first round with the original model in the present integration steps.
+    def _begun_again(self, first: Round) -> Round:
+        """Returns the first round with the original model in the present steps and priors.
 
-        Candidates whose fit was hopeless in coarse steps are not fitted again.
+        Candidates whose fit was hopeless before are not fitted again.
 
         Args:
-            first: The round in coarser steps.
+            first: The round in coarser steps, or with wider priors.
         """
         fitted = self.fit_base(near=first.hypothesis.parameters)
         hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}

@@ -1,7 +1,7 @@
 """The original model along a recording: its fit, with steps and priors that suffice for it."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Self
 
@@ -9,8 +9,9 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
-from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps
+from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps, with_priors_of
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -149,6 +150,31 @@ class OriginalModel:
         self.base, self.are_priors_widened = found.segments, True
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
+
+    def takes_own_priors(self, models: Sequence[Hypothesis]) -> bool:
+        """Takes the model's own priors again if they suffice with the effects that were added.
+
+        A missing effect can move parameters beyond their priors. Once it is added, wider priors
+        would only let these parameters imitate a part of it.
+
+        Args:
+            models: Models with effects and wider priors, the best first. With one of them, the
+                own priors must be as good as wider ones are with the best.
+
+        Returns:
+            Whether it has its own priors again.
+        """
+        if not self.are_priors_widened:
+            return False
+        model = self._model
+        for _ in range(num_finer_steps(self.base.model) - num_finer_steps(model)):
+            model = with_finer_steps(model)
+        own = self.base.with_model(model)
+        if all(with_priors_of(own, each, models[0]) is None for each in models):
+            return False
+        self._report("with the added effects, the model's own priors suffice")
+        self.base, self.are_priors_widened = own, False
+        return True
 
     def along(self, index: Tensor) -> Self:
         """Returns the same along some of the segments, with the current steps and priors.

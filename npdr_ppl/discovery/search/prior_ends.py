@@ -18,11 +18,23 @@ from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.model import Model
-from npdr_ppl.language.wider_priors import described_prior, widened, with_wider_priors
+from npdr_ppl.language.wider_priors import (
+    described_prior,
+    widened,
+    wider_sites,
+    with_wider_priors,
+)
 from npdr_ppl.preparation.closest_fit import part_of
 from npdr_ppl.preparation.segment_model import SegmentModel
 
-__all__ = ["PriorEnd", "Widened", "beyond", "widen_where_it_helps", "with_widest_priors"]
+__all__ = [
+    "PriorEnd",
+    "Widened",
+    "beyond",
+    "widen_where_it_helps",
+    "with_priors_of",
+    "with_widest_priors",
+]
 
 
 @dataclass(frozen=True)
@@ -89,6 +101,25 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     found = Trials(wider_base).with_own_starts(fitted)
     ends = beyond(priors, found)
     return Widened(wider_base, found, ends) if ends else None
+
+
+def with_priors_of(own: SegmentModel, current: Hypothesis, best: Hypothesis) -> Hypothesis | None:
+    """Refits a model with effects in the priors that it had before they were widened.
+
+    Args:
+        own: The model with these priors and without the effects, along the recording.
+        current: The closest fit of the model with effects and wider priors.
+        best: The best fit with wider priors, of any effects.
+
+    Returns:
+        The fit, or ``None`` if the best one with wider priors is clearly better.
+    """
+    before, now = (wider_sites(model) for model in (own.model, current.segments.model))
+    names = {name for sites in now[len(before) :] for name in sites}
+    found = Trials(own).refitted(current)
+    if found is None or _gain(found, best) >= _threshold(names):
+        return None
+    return found
 
 
 def with_widest_priors(
