@@ -9,10 +9,15 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
+from npdr_ppl.discovery.search.original_model import OriginalModel
 from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond, widen_where_it_helps
 from npdr_ppl.discovery.search.settings import PRIOR_ENDS
 from npdr_ppl.discovery.segment_options import segment_options
+from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
+from npdr_ppl.language.wider_priors import wider_sites, with_wider_priors
+from npdr_ppl.models.effects import Bias
 from npdr_ppl.models.pendulum import Pendulum, pendulum
+from npdr_ppl.preparation.segment_model import SegmentModel
 from tests.helpers.pendulum_recordings import TRUTH, swinging, too_short
 
 
@@ -124,6 +129,21 @@ def exact(longest):
         return npdr.simulate("trajectory", Pendulum(integrator="rk4"), parameters, inputs)
 
     return model
+
+
+@pytest.mark.parametrize(("longest", "suffices"), [(1.7, True), (0.75, False)])
+def test_widened_priors_are_given_up_where_the_models_own_suffice(recording, longest, suffices):
+    model = with_finer_steps(exact(longest))
+    original = OriginalModel(exact(longest), recording, segment_options(recording))
+    wider = with_wider_priors(model, ["length"])
+    original.base = SegmentModel(wider, recording, original.data_options)
+    original.are_priors_widened = True
+    current = original.trials.refitted(original.fit_base(), (Bias("hinge"),))
+    assert original.takes_own_priors([current]) == suffices
+    assert original.are_priors_widened != suffices
+    wide = ["length"] if not suffices else []
+    assert [name for names in wider_sites(original.base.model) for name in names] == wide
+    assert num_finer_steps(original.base.model) == 1
 
 
 def test_priors_that_contain_the_fit_or_end_within_its_error_are_left_as_they_are(recording):

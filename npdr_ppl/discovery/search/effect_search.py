@@ -103,13 +103,16 @@ class Searcher(OriginalModel):
             single = current if best is None else tried[best]
             if is_negligible(first.hypothesis, current, single):
                 single = current
-            likelier = self._with_law_at_several(rounds[-1], single)
-            extended = self._with_likelier_pair(rounds, likelier, max_effects)
-            if is_negligible(first.hypothesis, current, extended):
-                break
-            tested = best if extended is single else None
-            current = self.trials.with_own_starts(self._pruned(extended, tested))
-            if self._changes_model(current, rounds[-1]):
+            changes = single is not current and self._changes_model(single, rounds[-1])
+            if not changes:
+                likelier = self._with_law_at_several(rounds[-1], single)
+                extended = self._with_likelier_pair(rounds, likelier, max_effects)
+                if is_negligible(first.hypothesis, current, extended):
+                    break
+                tested = best if extended is single else None
+                current = self.trials.with_own_starts(self._pruned(extended, tested))
+                changes = extended is not single and self._changes_model(current, rounds[-1])
+            if changes:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
                 first = now = self._begun_again(rounds[0])
@@ -144,8 +147,7 @@ class Searcher(OriginalModel):
         models = [current, *rivals]
         if any(self.with_finer_steps(model) is not model for model in models):
             return True
-        # Without an effect, nothing has taken the place of the wider priors.
-        return bool(current.effects) and self.takes_own_priors(models)
+        return self.takes_own_priors(models)
 
     def _begun_again(self, first: Round) -> Round:
         """Returns the first round with the original model in the present steps and priors.

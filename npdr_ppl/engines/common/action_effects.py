@@ -1,15 +1,17 @@
 """The action effects of a simulator: what becomes of a command before it reaches the dynamics."""
 
+import copy
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from npdr_ppl.engines.common.chain_state import Moments, State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, RecentCommands
+from npdr_ppl.engines.common.compilation import signature
 from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.language.effect_context import Start
 from npdr_ppl.language.effects import ActionEffect, Commands, Uneven
@@ -20,6 +22,9 @@ __all__ = ["ActionEffects"]
 # Steps of past commands from which the memory of action effects at a segment's start is computed,
 # if no effect asks for more: longer than the delays of working control loops.
 _PAST_STEPS = 64
+
+# What effects with the same law at different channels may differ in.
+_OF_CHANNEL = frozenset({"port", "_priors"})
 
 
 class ActionEffects:
@@ -48,6 +53,20 @@ class ActionEffects:
         self.channels = sorted({channel for _, _, channel in self.effects})
         self._histories = histories[: len(self.effects)]
         self._time_step = time_step
+
+    def law(self, number: int) -> Hashable:
+        """Returns what the effect of a number does, whatever its channel and its parameters."""
+        effect = self.effects[number][1]
+        own = {name: value for name, value in vars(effect).items() if name not in _OF_CHANNEL}
+        return type(effect), signature(own), self._histories[number]
+
+    def at_one_channel(self, numbers: Sequence[int]) -> Self:
+        """Returns the effects of some numbers, in order, as those of channel 0 alone."""
+        own = copy.copy(self)
+        own.effects = [(k, self.effects[number][1], 0) for k, number in enumerate(numbers)]
+        own._histories = tuple(self._histories[number] for number in numbers)
+        own.channels = [0]
+        return own
 
     def num_past_steps(self, recorded: int) -> int:
         """Returns from how many steps of past commands a segment's start is computed.

@@ -1,10 +1,13 @@
-"""Simulations that receive the same commands.
+"""Simulations that receive the same commands, and channels whose commands pass the same laws.
 
 A fit simulates a recording with many parameters and initial states, but only a few of them change
 what effects on commands do. Past commands influence some effects for seconds, thousands of steps,
-so they are passed through the effects once for all simulations in which the result is the same.
+so they are passed through the effects once for all simulations in which the result is the same,
+and at once for all channels that have the same laws: the servos of an arm.
 """
 
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +18,7 @@ from npdr_ppl.engines.common.action_effects import ActionEffects
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord
 
-__all__ = ["Alike", "alike"]
+__all__ = ["Alike", "SameLaws", "alike", "same_laws"]
 
 
 class Alike(NamedTuple):
@@ -84,6 +87,71 @@ def alike(
         first,
         kind,
     )
+
+
+class SameLaws(NamedTuple):
+    """Channels whose commands pass the same laws, as one channel of C times as many simulations.
+
+    Attributes:
+        channels: Indices of the C action channels.
+        actions: The effects of one channel, whose index is 0.
+        state: State of the C N simulations, channel by channel.
+        tables: Constants of these simulations.
+        records: Their commands, of one channel.
+    """
+
+    channels: tuple[int, ...]
+    actions: ActionEffects
+    state: State
+    tables: Tables
+    records: tuple[CommandRecord, ...]
+
+
+def same_laws(
+    actions: ActionEffects, state: State, tables: Tables, records: tuple[CommandRecord, ...]
+) -> Iterator[SameLaws]:
+    """Yields the channels with effects, those with the same laws together.
+
+    Args:
+        actions: The effects on commands.
+        state: State of N simulations.
+        tables: Their constants.
+        records: Their commands.
+    """
+    numbers: dict[int, list[int]] = defaultdict(list)
+    for number, (_, _, channel) in enumerate(actions.effects):
+        numbers[channel].append(number)
+    together: dict[Hashable, list[int]] = defaultdict(list)
+    for channel, own in numbers.items():
+        together[tuple(actions.law(number) for number in own)].append(channel)
+    size = len(records[0].rows)
+
+    def joined(trees: Sequence[Any]) -> Any:
+        """Returns one tree for all channels, whose tensors are joined."""
+        return pytree.tree_map(
+            lambda *leaves: (
+                torch.cat([leaf.expand(size) for leaf in leaves])
+                if isinstance(leaves[0], Tensor)
+                else leaves[0]
+            ),
+            trees[0],
+            *trees[1:],
+        )
+
+    for channels in together.values():
+        # Of each law, its number at each of the channels.
+        laws = list(zip(*(numbers[channel] for channel in channels), strict=True))
+        own = [[tables.effects[actions.effects[number][0]] for number in law] for law in laws]
+        yield SameLaws(
+            tuple(channels),
+            actions.at_one_channel([law[0] for law in laws]),
+            state._replace(
+                action_memory=tuple(joined([state.action_memory[k] for k in law]) for law in laws),
+                past_commands=tuple(joined([state.past_commands[k] for k in law]) for law in laws),
+            ),
+            tables._replace(effects=tuple(joined(parameters) for parameters in own)),
+            (CommandRecord.joined([records[channel] for channel in channels]),),
+        )
 
 
 def _taken(tree: Any, index: Tensor) -> Any:

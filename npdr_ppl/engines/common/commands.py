@@ -72,6 +72,20 @@ class CommandRecord:
         self.rows = row.expand(batch_shape).reshape(-1)
         self.first = 1 + num_past
 
+    @classmethod
+    def joined(cls, records: Sequence["CommandRecord"]) -> "CommandRecord":
+        """Returns the commands of several channels, one after the other, as those of one.
+
+        Args:
+            records: Records of the same segments and simulations.
+        """
+        one = copy.copy(records[0])
+        one._table = torch.stack([record._table for record in records], dim=1)
+        one.table, one.stride = one._table.reshape(-1), one._table[0].numel()
+        one.rows = torch.cat([record.rows + k * record.stride for k, record in enumerate(records)])
+        one._batch_shape = None
+        return one
+
     def at(self, step: int) -> Tensor:
         """Returns the command of each simulation at a step, ``(N,)``; steps before 0 are past."""
         present = self._table[max(0, self.first + step)]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from npdr_ppl.engines.common.action_effects import ActionEffects
 from npdr_ppl.engines.common.alike import alike
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, commands_at
@@ -206,12 +207,12 @@ def with_past_commands(
     if not chain.actions.effects or not num_steps:
         return state
     few = alike(chain.actions, state, tables, records)
-    changed = after_past_commands(chain, few.state, few.tables, few.records, num_steps)
+    changed = after_past_commands(chain.actions, few.state, few.tables, few.records, num_steps)
     return few.spread(state, changed)
 
 
 def after_past_commands(
-    chain: EffectChain,
+    actions: ActionEffects,
     state: State,
     tables: Tables,
     records: tuple[CommandRecord, ...],
@@ -224,5 +225,5 @@ def after_past_commands(
     It stops before the step ``until``; the segment's first step is 0.
     """
     for step in range(-num_steps, until):
-        state, _, _ = chain.actions.act_on_record(state, records, step, tables)
+        state, _, _ = actions.act_on_record(state, records, step, tables)
     return state

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npdr_ppl.engines.common.alike import alike
+from npdr_ppl.engines.common.alike import SameLaws, alike, same_laws
 from npdr_ppl.engines.common.batching import flatten
 from npdr_ppl.engines.common.chain_state import State, Tables
 from npdr_ppl.engines.common.commands import CommandRecord, command_records, commands_at
@@ -219,26 +219,42 @@ class _Replay:
         Without action effects, the third axis has size 1. The steps begin with the past ones that
         carriers need.
         """
-        rows = self.rows[first:last]
+        controls = self.commands[self.rows[first:last], :, None]
         if not chain.actions.effects:
-            return self.commands[rows, :, None]
-        few = alike(chain.actions, state, tables, records)
-        state, tables, records = few.state, few.tables, few.records
-        controls = self.commands[rows[few.first.numpy()], :, None]
+            return controls
         controls = np.repeat(controls, chain.substeps, axis=2)
-        num_before = self.carriers.num_steps
         past = self._num_past(chain)
-        state = after_past_commands(chain, state, tables, records, past, until=-num_before)
-        for k in range(controls.shape[1]):
-            state, actions, moments = chain.actions.act_on_record(
-                state, records, k - num_before, tables
+        for same in same_laws(chain.actions, state, tables, records):
+            acted = self._acted(same, chain.substeps, past, controls.shape[1])
+            for channel, own in zip(same.channels, acted, strict=True):
+                controls[..., channel] = own
+        return controls
+
+    def _acted(
+        self, same: SameLaws, substeps: int, past: int, num_steps: int
+    ) -> NDArray[np.float64]:
+        """Returns the actions of channels with the same laws, ``(channels, n, steps, parts)``.
+
+        Args:
+            same: The channels.
+            substeps: Engine steps per step, the parts.
+            past: Number of past commands from which the effects' states are computed.
+            num_steps: Number of steps.
+        """
+        few = alike(same.actions, same.state, same.tables, same.records)
+        num_before = self.carriers.num_steps
+        state = after_past_commands(
+            same.actions, few.state, few.tables, few.records, past, until=-num_before
+        )
+        acted = np.empty((len(few.first), num_steps, substeps))
+        for k in range(num_steps):
+            state, reached, moments = same.actions.act_on_record(
+                state, few.records, k - num_before, few.tables
             )
-            reached = tuple(moments.get(channel) for channel in actions)
-            means, _ = chain.actions.by_substep(tuple(actions.values()), reached, chain.substeps)
-            for part, present in enumerate(means):
-                for channel, action in zip(actions, present, strict=True):
-                    controls[:, k, part, channel] = action.numpy()
-        return controls[few.kind.numpy()]
+            means, _ = same.actions.by_substep((reached[0],), (moments.get(0),), substeps)
+            for part, (mean,) in enumerate(means):
+                acted[:, k, part] = mean.numpy()
+        return acted[few.kind.numpy()].reshape(len(same.channels), -1, num_steps, substeps)
 
     def _step_by_step(
         self,
