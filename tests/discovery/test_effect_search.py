@@ -116,13 +116,14 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
     assert abs(losses[0] - losses[1]) < 1.0
 
 
-def test_what_was_hopeless_in_coarse_steps_is_not_fitted_again(dragged):
+@pytest.mark.parametrize("looks", [True, False])
+def test_what_was_hopeless_in_coarse_steps_is_not_fitted_again(dragged, looks):
     case, _ = dragged
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=(Bias("hinge"),)))
     looked = searcher.look(searcher.fit_base())
     weights = {"": 0.0, "hinge.bias": 1e-200, "hinge.cogging": 0.3}
     coarse = replace(looked, weights=weights, hopeless=frozenset({"hinge.spring"}))
-    again = searcher._begun_again(coarse)
+    again = searcher._begun_again(coarse, looks=looks)
     assert again.hopeless == {"", "hinge.bias", "hinge.spring"}
     assert again.hypothesis is not looked.hypothesis
     assert not again.weights

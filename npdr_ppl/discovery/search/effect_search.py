@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Self
+from typing import Literal, Self
 
 from torch import Tensor
 
@@ -103,19 +103,19 @@ class Searcher(OriginalModel):
             single = current if best is None else tried[best]
             if is_negligible(first.hypothesis, current, single):
                 single = current
-            changes = single is not current and self._changes_model(single, rounds[-1])
-            if not changes:
+            changed = self._changed(single, rounds[-1]) if single is not current else ""
+            if not changed:
                 likelier = self._with_law_at_several(rounds[-1], single)
                 extended = self._with_likelier_pair(rounds, likelier, max_effects)
                 if is_negligible(first.hypothesis, current, extended):
                     break
                 tested = best if extended is single else None
                 current = self.trials.with_own_starts(self._pruned(extended, tested))
-                changes = extended is not single and self._changes_model(current, rounds[-1])
-            if changes:
+                changed = self._changed(current, rounds[-1]) if extended is not single else ""
+            if changed:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
-                first = now = self._begun_again(rounds[0])
+                first = now = self._begun_again(rounds[0], looks=changed == "steps")
                 current, rounds = first.hypothesis, [first]
                 continue
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
@@ -124,7 +124,7 @@ class Searcher(OriginalModel):
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
 
-    def _changes_model(self, current: Hypothesis, now: Round) -> bool:
+    def _changed(self, current: Hypothesis, now: Round) -> Literal["", "steps", "priors"]:
         """Takes finer steps if the present ones are too coarse, or own priors if they suffice.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
@@ -136,30 +136,38 @@ class Searcher(OriginalModel):
             now: The round that added the last one, with what it tried.
 
         Returns:
-            Whether steps or priors were changed.
+            What was changed; empty if nothing was.
         """
         if self._deadline.stops():
-            return False
+            return ""
         likeliest = sorted(now.trials, key=lambda name: now.weights[name], reverse=True)
         # Others were not fitted to convergence, and would gain by that alone.
         rivals = [now.trials[name] for name in likeliest[: TRIALS.most_converged]]
         rivals = [trial for trial in rivals if set(trial.names) != set(current.names)]
         models = [current, *rivals]
         if any(self.with_finer_steps(model) is not model for model in models):
-            return True
-        return self.takes_own_priors(models)
+            return "steps"
+        return "priors" if self.takes_own_priors(models) else ""
 
-    def _begun_again(self, first: Round) -> Round:
+    def _begun_again(self, first: Round, *, looks: bool) -> Round:
         """Returns the first round with the original model in the present steps and priors.
 
         Candidates whose fit was hopeless before are not fitted again.
 
         Args:
             first: The round in coarser steps, or with wider priors.
+            looks: Whether to screen the candidates again. In other priors, those that explain most
+                are the same.
         """
         fitted = self.fit_base(near=first.hypothesis.parameters)
         hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
-        return replace(self.look(fitted), hopeless=first.hopeless | hopeless)
+        again = self.look(fitted) if looks else replace(first, weights={}, trials={})
+        return replace(
+            again,
+            hypothesis=fitted,
+            averaged=fitted.averaged(),
+            hopeless=first.hopeless | hopeless,
+        )
 
     def _revised(self, current: Hypothesis, rounds: list[Round], max_effects: int) -> Search:
         """Returns the effects that are found again, in their simplest form, and alternatives.
