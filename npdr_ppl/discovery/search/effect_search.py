@@ -103,15 +103,22 @@ class Searcher(OriginalModel):
             single = current if best is None else tried[best]
             if is_negligible(first.hypothesis, current, single):
                 single = current
-            changed = self._changed(single, rounds[-1]) if single is not current else ""
+            changed = ""
+            if single is not current:
+                single = self.trials.with_own_starts(single)
+                changed = self._changed(single, rounds[-1])
             if not changed:
                 likelier = self._with_law_at_several(rounds[-1], single)
                 extended = self._with_likelier_pair(rounds, likelier, max_effects)
-                if is_negligible(first.hypothesis, current, extended):
+                is_new = extended is not single
+                if extended is current or (
+                    is_new and is_negligible(first.hypothesis, current, extended)
+                ):
                     break
-                tested = best if extended is single else None
-                current = self.trials.with_own_starts(self._pruned(extended, tested))
-                changed = self._changed(current, rounds[-1]) if extended is not single else ""
+                current = self._pruned(extended, None if is_new else best)
+                if current is not single:
+                    current = self.trials.with_own_starts(current)
+                changed = self._changed(current, rounds[-1]) if is_new else ""
             if changed:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
@@ -142,12 +149,20 @@ class Searcher(OriginalModel):
             return ""
         likeliest = sorted(now.trials, key=lambda name: now.weights[name], reverse=True)
         # Others were not fitted to convergence, and would gain by that alone.
-        rivals = [now.trials[name] for name in likeliest[: TRIALS.most_converged]]
-        rivals = [trial for trial in rivals if set(trial.names) != set(current.names)]
-        models = [current, *rivals]
+        rivals = {
+            name: now.trials[name]
+            for name in likeliest[: TRIALS.most_converged]
+            if set(now.trials[name].names) != set(current.names)
+        }
+        models = [current, *rivals.values()]
         if any(self.with_finer_steps(model) is not model for model in models):
             return "steps"
-        return "priors" if self.takes_own_priors(models) else ""
+        possible = (
+            self.trials.with_own_starts(rival)
+            for name, rival in rivals.items()
+            if now.weights[name] >= EVIDENCE.least_probability
+        )
+        return "priors" if self.takes_own_priors(current, possible) else ""
 
     def _begun_again(self, first: Round, *, looks: bool) -> Round:
         """Returns the first round with the original model in the present steps and priors.

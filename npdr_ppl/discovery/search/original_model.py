@@ -1,8 +1,9 @@
 """The original model along a recording: its fit, with steps and priors that suffice for it."""
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
+from itertools import chain
 from typing import Self
 
 from torch import Tensor
@@ -151,26 +152,28 @@ class OriginalModel:
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
 
-    def takes_own_priors(self, models: Sequence[Hypothesis]) -> bool:
+    def takes_own_priors(self, current: Hypothesis, rivals: Iterable[Hypothesis] = ()) -> bool:
         """Takes the model's own priors again if they suffice with the effects that were added.
 
         A missing effect can move parameters beyond their priors. Once it is added, wider priors
         would only let these parameters imitate a part of it.
 
         Args:
-            models: Models with effects and wider priors, the best first. With one of them, the
-                own priors must be as good as wider ones are with the best.
+            current: The best model with effects and wider priors.
+            rivals: Others that are possible. With one of all these, the own priors must be as good
+                as wider ones are with the best.
 
         Returns:
             Whether it has its own priors again.
         """
         if not self.are_priors_widened:
             return False
-        model = self._model
-        for _ in range(num_finer_steps(self.base.model) - num_finer_steps(model)):
-            model = with_finer_steps(model)
-        own = self.base.with_model(model)
-        if all(with_priors_of(own, each, models[0]) is None for each in models):
+        given = self._model
+        for _ in range(num_finer_steps(self.base.model) - num_finer_steps(given)):
+            given = with_finer_steps(given)
+        own = self.base.with_model(given)
+        models = chain((current,), rivals)
+        if all(with_priors_of(own, model, current) is None for model in models):
             return False
         self._report("with the added effects, the model's own priors suffice")
         self.base, self.are_priors_widened = own, False
