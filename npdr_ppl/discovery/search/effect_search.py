@@ -171,12 +171,16 @@ class Searcher(OriginalModel):
 
         Args:
             first: The round in coarser steps, or with wider priors.
-            looks: Whether to screen the candidates again. In other priors, those that explain most
-                are the same.
+            looks: Whether to screen the candidates again. In narrower priors, only those can explain
+                as much that did before.
         """
         fitted = self.fit_base(near=first.hypothesis.parameters)
         hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
-        again = self.look(fitted) if looks else replace(first, weights={}, trials={})
+        if looks:
+            again = self.look(fitted)
+        else:
+            again = replace(first, weights={}, trials={})
+            hopeless |= {c.name for c in first.ranking if c.name not in first.weights}
         return replace(
             again,
             hypothesis=fitted,
