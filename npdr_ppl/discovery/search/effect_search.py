@@ -23,7 +23,7 @@ from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
+from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist, log_evidence
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -122,7 +122,7 @@ class Searcher(OriginalModel):
             if changed:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
-                first = now = self._begun_again(rounds[0], looks=changed == "steps")
+                first = now = self._begun_again(rounds[0], looks=changed == "much")
                 current, rounds = first.hypothesis, [first]
                 continue
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
@@ -131,7 +131,7 @@ class Searcher(OriginalModel):
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
 
-    def _changed(self, current: Hypothesis, now: Round) -> Literal["", "steps", "priors"]:
+    def _changed(self, current: Hypothesis, now: Round) -> Literal["", "much", "little"]:
         """Takes finer steps if the present ones are too coarse, or own priors if they suffice.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
@@ -143,7 +143,8 @@ class Searcher(OriginalModel):
             now: The round that added the last one, with what it tried.
 
         Returns:
-            What was changed; empty if nothing was.
+            ``"much"`` if finer steps change the evidence so much that other candidates could now
+            explain most, ``"little"`` after any other change, empty if nothing was changed.
         """
         if self._deadline.stops():
             return ""
@@ -154,15 +155,17 @@ class Searcher(OriginalModel):
             for name in likeliest[: TRIALS.most_converged]
             if set(now.trials[name].names) != set(current.names)
         }
-        models = [current, *rivals.values()]
-        if any(self.with_finer_steps(model) is not model for model in models):
-            return "steps"
+        for model in (current, *rivals.values()):
+            finer = self.with_finer_steps(model)
+            if finer is not model:
+                is_much = log_evidence(model, finer) > TRIALS.certain_evidence
+                return "much" if is_much else "little"
         possible = (
             self.trials.with_own_starts(rival)
             for name, rival in rivals.items()
             if now.weights[name] >= EVIDENCE.least_probability
         )
-        return "priors" if self.takes_own_priors(current, possible) else ""
+        return "little" if self.takes_own_priors(current, possible) else ""
 
     def _begun_again(self, first: Round, *, looks: bool) -> Round:
         """Returns the first round with the original model in the present steps and priors.
@@ -171,8 +174,8 @@ class Searcher(OriginalModel):
 
         Args:
             first: The round in coarser steps, or with wider priors.
-            looks: Whether to screen the candidates again. In narrower priors, only those can explain
-                as much that did before.
+            looks: Whether to screen the candidates again, because others could now explain most.
+                In narrower priors, only those can explain as much that did before.
         """
         fitted = self.fit_base(near=first.hypothesis.parameters)
         hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
