@@ -23,7 +23,12 @@ from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist, log_evidence
+from npdr_ppl.discovery.search.shortlist import (
+    fit_contenders,
+    fit_shortlist,
+    log_evidence,
+    with_starts_of_best,
+)
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -105,7 +110,8 @@ class Searcher(OriginalModel):
                 single = current
             changed = ""
             if single is not current:
-                single = self.trials.with_own_starts(single)
+                if single.segments.starts is current.segments.starts:
+                    single = self.trials.with_own_starts(single)
                 changed = self._changed(single, rounds[-1])
             if not changed:
                 likelier = self._with_law_at_several(rounds[-1], single)
@@ -294,6 +300,7 @@ class Searcher(OriginalModel):
         trials = fit_contenders(self.trials, trials, current, progress=progress)
         if not trials:
             return None, {}, {}
+        trials = with_starts_of_best(self.trials, trials, current)
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         prior = [

@@ -21,6 +21,7 @@ __all__ = [
     "fit_groups",
     "fit_shortlist",
     "log_evidence",
+    "with_starts_of_best",
 ]
 
 
@@ -100,10 +101,7 @@ def fit_contenders(
     best = closest(list(compared.values()))
     losses = {name: float(trial.losses(best.fit.scale).sum()) for name, trial in compared.items()}
     least = min(losses.values())
-    # By loss alone, laws with more parameters would crowd out the simple law they contain.
-    by_block = evidence(list(compared.values()), [0.0] * len(compared), best)
-    likelihood = dict(zip(compared, by_block.sum(-1).tolist(), strict=True))
-    likeliest = sorted(compared, key=lambda name: -likelihood[name])
+    likeliest = _likeliest(compared)
     contenders = [
         name
         for name in likeliest[:most]
@@ -136,6 +134,38 @@ def fit_contenders(
             (found,) = trials.fits([asked(name)], current.simulator)
             result |= {} if found is None else {name: found}
     return result
+
+
+def with_starts_of_best(
+    trials: Trials, tried: Mapping[str, Hypothesis], current: Hypothesis
+) -> Mapping[str, Hypothesis]:
+    """Fits the likeliest trials with initial states along the motion of the best, if need be.
+
+    The initial states of trials are those of the model without the candidates. Where that model is
+    far off, so are they, and an alternative that can compensate for their errors seems likelier
+    than another that cannot: behind stiff servos, a delay of all sensors than one of all commands.
+
+    Args:
+        trials: Fits the model.
+        tried: The model with each of several effects.
+        current: The model without them.
+
+    Returns:
+        The trials as they are if no candidate explains very much; else the likeliest ones.
+    """
+    if log_evidence(current, closest(list(tried.values()))) <= TRIALS.enough_evidence:
+        return tried
+    first, *others = _likeliest(tried)[: TRIALS.most_converged]
+    best = trials.with_own_starts(tried[first])
+    if best is tried[first]:
+        return tried
+    asked = []
+    for name in others:
+        segments = trials.with_effects(tried[name].effects, best.segments.starts)
+        assert segments is not None
+        asked.append(refit(segments, tried[name], tried[name].effects, {}, segments.no_offsets))
+    found = zip(others, trials.fits(asked, current.simulator), strict=True)
+    return {first: best} | {name: trial for name, trial in found if trial is not None}
 
 
 def fit_groups(
@@ -261,6 +291,17 @@ def log_evidence(current: Hypothesis, other: Hypothesis) -> float:
     """
     scale = other.fit.scale
     return other.share * float((current.losses(scale) - other.losses(scale)).sum())
+
+
+def _likeliest(tried: Mapping[str, Hypothesis]) -> list[str]:
+    """Returns the names of models along the same segments, the likeliest first.
+
+    By loss alone, laws with more parameters would crowd out the simple law they contain.
+    """
+    models = list(tried.values())
+    by_block = evidence(models, [0.0] * len(models), closest(models))
+    likelihood = dict(zip(tried, by_block.sum(-1).tolist(), strict=True))
+    return sorted(tried, key=lambda name: -likelihood[name])
 
 
 def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:
