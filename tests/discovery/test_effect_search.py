@@ -10,7 +10,12 @@ from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search import rivals, shortlist
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.rivals import with_rivals
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
+from npdr_ppl.discovery.search.shortlist import (
+    fit_contenders,
+    fit_shortlist,
+    log_evidence,
+    with_starts_of_best,
+)
 from npdr_ppl.models.effects import (
     Bias,
     Cogging,
@@ -114,6 +119,32 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
         for trial in (found["hinge.quadratic_drag"], expected)
     ]
     assert abs(losses[0] - losses[1]) < 1.0
+
+
+def test_rivals_of_a_candidate_that_explains_very_much_start_where_it_does(dragged, monkeypatch):
+    case, base = dragged
+    laws = QuadraticDrag("hinge"), ViscousFriction("hinge"), Bias("hinge")
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=laws))
+    tried = {law.name: searcher.trials.refitted(base, (law,)) for law in laws}
+    drag = tried["hinge.quadratic_drag"]
+    evidence = log_evidence(base, drag)
+
+    def with_enough(evidence):
+        settings = replace(shortlist.TRIALS, enough_evidence=evidence, most_converged=2)
+        monkeypatch.setattr(shortlist, "TRIALS", settings)
+        return with_starts_of_best(searcher.trials, tried, base)
+
+    assert with_enough(1.1 * evidence) == tried
+    found = with_enough(0.9 * evidence)
+    assert list(found) == ["hinge.quadratic_drag", "hinge.viscous_friction"]
+    starts = [trial.segments.starts for trial in found.values()]
+    assert starts[0] is starts[1] is not base.segments.starts
+    # The measured states are accurate here, so that little changes.
+    before, after = (
+        log_evidence(each["hinge.viscous_friction"], each["hinge.quadratic_drag"])
+        for each in (tried, found)
+    )
+    assert after == pytest.approx(before, rel=0.1)
 
 
 @pytest.mark.parametrize("looks", [True, False])
