@@ -23,12 +23,7 @@ from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
-from npdr_ppl.discovery.search.shortlist import (
-    fit_contenders,
-    fit_shortlist,
-    log_evidence,
-    with_starts_of_best,
-)
+from npdr_ppl.discovery.search.shortlist import fit_rivals, fit_shortlist, log_evidence
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -297,10 +292,9 @@ class Searcher(OriginalModel):
         if not trials:
             return None, {}, {}
         progress = self._progress.stage(label)
-        trials = fit_contenders(self.trials, trials, current, progress=progress)
+        trials = fit_rivals(self.trials, trials, current, progress=progress)
         if not trials:
             return None, {}, {}
-        trials = with_starts_of_best(self.trials, trials, current)
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))
         hypotheses = [current, *trials.values()]
         prior = [

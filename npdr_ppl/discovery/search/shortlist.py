@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,15 +14,16 @@ from npdr_ppl.discovery.search.evidence import closest, evidence
 from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.discovery.search.trials import Fit, Trials, refit
 from npdr_ppl.preparation.closest_fit import part_of
+from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.progress import Step
 
 __all__ = [
     "enough_segments",
     "fit_contenders",
     "fit_groups",
+    "fit_rivals",
     "fit_shortlist",
     "log_evidence",
-    "with_starts_of_best",
 ]
 
 
@@ -98,16 +100,7 @@ def fit_contenders(
         index = part_of(current.segments, part.inputs.num_segments)
         known = {name: hypothesis.along(index) for name, hypothesis in result.items()}
     compared = {**known, **tried}
-    best = closest(list(compared.values()))
-    losses = {name: float(trial.losses(best.fit.scale).sum()) for name, trial in compared.items()}
-    least = min(losses.values())
-    likeliest = _likeliest(compared)
-    contenders = [
-        name
-        for name in likeliest[:most]
-        if name in tried
-        and losses[name] <= least + max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
-    ]
+    contenders = [name for name in _contenders(compared, most) if name in tried]
     if not is_part:
         result |= tried
 
@@ -115,9 +108,7 @@ def fit_contenders(
         trial = tried[name]
         if not is_part:
             return refit(trial.segments, trial, trial.effects, {})
-        segments = trials.with_effects(trial.effects, current.segments.starts)
-        assert segments is not None
-        return refit(segments, trial, trial.effects, {}, current.fit.offsets)
+        return _whole(trials, trial, current)
 
     num = len(contenders)
     progress(0.0, f"0 of {num} best fits converged")
@@ -126,7 +117,7 @@ def fit_contenders(
         if longer is not None:
             result[name] = longer
         progress(number / num, f"{number} of {num} best fits converged")
-    for name in likeliest:
+    for name in _likeliest(compared):
         if not is_part or not contenders or not result.keys().isdisjoint(contenders):
             break
         # None of the likeliest can be simulated along all segments.
@@ -136,36 +127,70 @@ def fit_contenders(
     return result
 
 
-def with_starts_of_best(
-    trials: Trials, tried: Mapping[str, Hypothesis], current: Hypothesis
-) -> Mapping[str, Hypothesis]:
-    """Fits the likeliest trials with initial states along the motion of the best, if need be.
+def fit_rivals(
+    trials: Trials,
+    tried: Mapping[str, Hypothesis],
+    current: Hypothesis,
+    *,
+    progress: Step = lambda fraction, status: None,
+) -> dict[str, Hypothesis]:
+    """Fits the likeliest trials until convergence, all with the same initial states.
 
-    The initial states of trials are those of the model without the candidates. Where that model is
-    far off, so are they, and an alternative that can compensate for their errors seems likelier
-    than another that cannot: behind stiff servos, a delay of all sensors than one of all commands.
+    They are those along the motion of the model without the candidates, as in
+    :func:`fit_contenders`. Where one candidate explains very much, that model is far off, and so
+    are they. An alternative that can compensate for their errors then seems likelier than another
+    that cannot: behind stiff servos, a delay of all sensors than one of all commands. They are
+    then those along the motion of the likeliest trial.
 
     Args:
         trials: Fits the model.
-        tried: The model with each of several effects.
-        current: The model without them.
+        tried: The model with each of several effects, all along the same segments.
+        current: The model without them, along all segments.
+        progress: Called with the fraction of these trials that has converged.
 
     Returns:
-        The trials as they are if no candidate explains very much; else the likeliest ones.
+        The models along all segments.
     """
-    if log_evidence(current, closest(list(tried.values()))) <= TRIALS.enough_evidence:
-        return tried
-    first, *others = _likeliest(tried)[: TRIALS.most_converged]
-    best = trials.with_own_starts(tried[first])
-    if best is tried[first]:
-        return tried
-    asked = []
-    for name in others:
-        segments = trials.with_effects(tried[name].effects, best.segments.starts)
-        assert segments is not None
-        asked.append(refit(segments, tried[name], tried[name].effects, {}, segments.no_offsets))
-    found = zip(others, trials.fits(asked, current.simulator), strict=True)
-    return {first: best} | {name: trial for name, trial in found if trial is not None}
+    if not tried:
+        return {}
+    part = next(iter(tried.values())).segments
+    whole, num = current.segments.inputs.num_segments, part.inputs.num_segments
+    # A part is enough only where the best candidate explains very much.
+    is_much = num < whole or (
+        log_evidence(current, closest(list(tried.values()))) > TRIALS.enough_evidence
+    )
+    found: dict[str, Hypothesis] = {}
+    if is_much:
+        names = _contenders(tried, TRIALS.most_converged)
+        begun = replace(_whole(trials, tried[names[0]], current), is_trial=True)
+        (best,) = trials.fits([begun], current.simulator)
+        starts = None if best is None else best.estimated_starts()
+        if starts is not None:
+            asked = [_whole(trials, tried[name], current, starts) for name in names]
+            progress(0.0, f"0 of {len(names)} best fits converged")
+            fits = trials.fits(asked, current.simulator)
+            for number, (name, longer) in enumerate(zip(names, fits, strict=True), 1):
+                if longer is not None and longer.can_be_linearised:
+                    found[name] = longer
+                progress(number / len(names), f"{number} of {len(names)} best fits converged")
+    return found or fit_contenders(trials, tried, current, progress=progress)
+
+
+def _whole(
+    trials: Trials, trial: Hypothesis, current: Hypothesis, starts: InitialStates | None = None
+) -> Fit:
+    """Returns the fit of a trial along all segments.
+
+    Args:
+        trials: Fits the model.
+        trial: The trial.
+        current: A model along all segments, whose initial states are used by default.
+        starts: Other initial states.
+    """
+    segments = trials.with_effects(trial.effects, starts or current.segments.starts)
+    assert segments is not None
+    offsets = current.fit.offsets if starts is None else segments.no_offsets
+    return refit(segments, trial, trial.effects, {}, offsets)
 
 
 def fit_groups(
@@ -291,6 +316,20 @@ def log_evidence(current: Hypothesis, other: Hypothesis) -> float:
     """
     scale = other.fit.scale
     return other.share * float((current.losses(scale) - other.losses(scale)).sum())
+
+
+def _contenders(compared: Mapping[str, Hypothesis], most: int) -> list[str]:
+    """Returns the names of the likeliest models whose loss is not far above the least.
+
+    Args:
+        compared: Models along the same segments, by name.
+        most: Greatest number of names.
+    """
+    scale = closest(list(compared.values())).fit.scale
+    losses = {name: float(trial.losses(scale).sum()) for name, trial in compared.items()}
+    least = min(losses.values())
+    most_lost = max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
+    return [name for name in _likeliest(compared)[:most] if losses[name] <= least + most_lost]
 
 
 def _likeliest(tried: Mapping[str, Hypothesis]) -> list[str]:
