@@ -38,8 +38,8 @@ class SensorDelay(BentSensorEffect):
 
     The measurement at a segment's start is the state d earlier. The segment's initial state is
     computed from it by the simulator without its effects, under the commands of that time. The
-    measurements until d has passed are computed in the same way, backwards. A robot at rest at a
-    rollout's first sample counts as held there before.
+    measurements until d has passed are those on the way. A robot at rest at a rollout's first
+    sample counts as held there before.
     """
 
     id = "sensor_delay"

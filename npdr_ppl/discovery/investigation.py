@@ -266,13 +266,15 @@ class Investigation:
         search, holdout, options = self.search, self.holdout, None
         if holdout is not None:
             options = held_out_options(self._short_options, self.rollouts, holdout)
-        begun = [self.start, *([search.final] if search.added else [])]
+        # With the steps and priors that the search ended with.
+        original = search.rounds[0].hypothesis
+        begun = [original, *([search.final] if search.added else [])]
         with self.progress.timed("learn"):
             starts = [self._in_short_segments(start) for start in begun]
             found = learn(
                 Trials(starts[0].segments),
                 starts,
-                candidates_at(self.start, self.settings),
+                candidates_at(original, self.settings),
                 holdout=holdout,
                 options=options,
                 assumptions=Assumptions(self.settings.symmetry, self.settings.is_passive),
@@ -288,7 +290,7 @@ class Investigation:
         if self._short_options == self._data_options:
             return hypothesis
         return fit_hypothesis(
-            self.start.model,
+            self.search.rounds[0].hypothesis.model,
             self.rollouts,
             self._short_options,
             effects=hypothesis.effects,

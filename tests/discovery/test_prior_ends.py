@@ -139,7 +139,7 @@ def test_widened_priors_are_given_up_where_the_models_own_suffice(recording, lon
     original.base = SegmentModel(wider, recording, original.data_options)
     original.are_priors_widened = True
     current = original.trials.refitted(original.fit_base(), (Bias("hinge"),))
-    assert original.takes_own_priors(current) == suffices
+    assert original.take_own_priors(current) == suffices
     assert original.are_priors_widened != suffices
     wide = ["length"] if not suffices else []
     assert [name for names in wider_sites(original.base.model) for name in names] == wide

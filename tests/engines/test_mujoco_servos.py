@@ -346,6 +346,36 @@ def test_late_sensors_of_a_servo_that_damps_within_a_step_start_where_the_joint_
     assert error[:, 0].max() < 3e-5 and error[:, 1].max() < 0.03 * whole[begin:, 1].abs().max()
 
 
+@pytest.mark.parametrize("share", [0.3, 1.4, 5.4])
+@pytest.mark.parametrize(("kp", "kv"), [(GAIN, DAMPING), (1000.0, 100.0)])
+def test_late_positions_alone_are_read_on_their_own_parabola(kp, kv, share):
+    """No sensor shows the rate; the bend of a step needs the positions of the two before it."""
+    given = joint(kp=kp, kv=kv)
+    both = given.with_finer_steps()
+    alone = MujocoSimulator(given.model, sensors=["hinge"]).with_finer_steps()
+    begin, num, delay = 60, 20, share * STEP
+    commands = 0.3 * torch.sin(5.0 * STEP * torch.arange(begin + num, dtype=torch.float64))
+    late = both.with_effects(SensorDelay("hinge,hinge_velocity"))
+    whole = replay(late, {"hinge,hinge_velocity.sensor_delay.delay": delay}, commands)
+    position, rate = whole[begin - 1]
+    inputs = Inputs.single(
+        commands[begin:, None],
+        position[None],
+        action_names=("goal",),
+        state_names=("hinge",),
+        time_step=STEP,
+    )
+    inputs = replace(
+        inputs,
+        start=torch.tensor([begin]),
+        initial_rates=rate[None, None],
+        past_actions=commands[None, :begin, None],
+    )
+    parameters = {"hinge.sensor_delay.delay": torch.tensor(delay).double()}
+    out = alone.with_effects(SensorDelay("hinge")).simulate(parameters, inputs)[0, :, 0]
+    assert (out - whole[begin:, 0]).abs().max() < 1e-5
+
+
 def test_laws_of_goals_need_a_servo_that_follows_its_joint():
     names = {effect.name for effect in candidate_effects(joint())}
     assert {"goal.servo_dead_band", "goal.servo_force_limit", "goal.goal_speed_limit"} < names

@@ -105,9 +105,8 @@ class Searcher(OriginalModel):
                 single = current
             changed = ""
             if single is not current:
-                if single.segments.starts is current.segments.starts:
-                    single = self.trials.with_own_starts(single)
-                changed = self._changed(single, rounds[-1])
+                single = self.trials.with_own_starts(single)
+                changed = self._settle(single, rounds[-1])
             if not changed:
                 likelier = self._with_law_at_several(rounds[-1], single)
                 extended = self._with_likelier_pair(rounds, likelier, max_effects)
@@ -119,7 +118,7 @@ class Searcher(OriginalModel):
                 current = self._pruned(extended, None if is_new else best)
                 if current is not single:
                     current = self.trials.with_own_starts(current)
-                changed = self._changed(current, rounds[-1]) if is_new else ""
+                changed = self._settle(current, rounds[-1]) if is_new else ""
             if changed:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
@@ -132,12 +131,12 @@ class Searcher(OriginalModel):
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
 
-    def _changed(self, current: Hypothesis, now: Round) -> Literal["", "much", "little"]:
+    def _settle(self, current: Hypothesis, now: Round) -> Literal["", "much", "little"]:
         """Takes finer steps if the present ones are too coarse, or own priors if they suffice.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
-        measurement does not: in coarse steps, the wrong one of the two can fit better. So can the
-        wrong one with wide priors. Both are therefore decided by the likeliest rivals, too.
+        measurement does not: in coarse steps, the wrong one of the two can fit better. With wide
+        priors it can fit better, too. So the likeliest alternatives are asked as well.
 
         Args:
             current: The model with the effects that were added.
@@ -166,7 +165,7 @@ class Searcher(OriginalModel):
             for name, rival in rivals.items()
             if now.weights[name] >= EVIDENCE.least_probability
         )
-        return "little" if self.takes_own_priors(current, possible) else ""
+        return "little" if self.take_own_priors(current, possible) else ""
 
     def _begun_again(self, first: Round, *, looks: bool) -> Round:
         """Returns the first round with the original model in the present steps and priors.
@@ -181,14 +180,14 @@ class Searcher(OriginalModel):
         fitted = self.fit_base(near=first.hypothesis.parameters)
         hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
         if looks:
-            again = self.look(fitted)
-        else:
-            again = replace(first, weights={}, trials={})
-            hopeless |= {c.name for c in first.ranking if c.name not in first.weights}
+            return replace(self.look(fitted), hopeless=frozenset(hopeless))
+        hopeless |= {c.name for c in first.ranking if c.name not in first.weights}
         return replace(
-            again,
+            first,
             hypothesis=fitted,
             averaged=fitted.averaged(),
+            weights={},
+            trials={},
             hopeless=first.hopeless | hopeless,
         )
 

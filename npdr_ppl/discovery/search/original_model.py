@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
-from npdr_ppl.discovery.search.prior_ends import widen_where_it_helps, with_priors_of
+from npdr_ppl.discovery.search.prior_ends import own_priors_suffice, widen_where_it_helps
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
 from npdr_ppl.language.model import Model
@@ -152,7 +152,7 @@ class OriginalModel:
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
 
-    def takes_own_priors(self, current: Hypothesis, rivals: Iterable[Hypothesis] = ()) -> bool:
+    def take_own_priors(self, current: Hypothesis, rivals: Iterable[Hypothesis] = ()) -> bool:
         """Takes the model's own priors again if they suffice with the effects that were added.
 
         A missing effect can move parameters beyond their priors. Once it is added, wider priors
@@ -173,7 +173,7 @@ class OriginalModel:
             given = with_finer_steps(given)
         own = self.base.with_model(given)
         models = chain((current,), rivals)
-        if all(with_priors_of(own, model, current) is None for model in models):
+        if not any(own_priors_suffice(own, model, current) for model in models):
             return False
         self._report("with the added effects, the model's own priors suffice")
         self.base, self.are_priors_widened = own, False

@@ -31,8 +31,8 @@ __all__ = [
     "PriorEnd",
     "Widened",
     "beyond",
+    "own_priors_suffice",
     "widen_where_it_helps",
-    "with_priors_of",
     "with_widest_priors",
 ]
 
@@ -103,23 +103,18 @@ def widen_where_it_helps(base: SegmentModel, current: Hypothesis) -> Widened | N
     return Widened(wider_base, found, ends) if ends else None
 
 
-def with_priors_of(own: SegmentModel, current: Hypothesis, best: Hypothesis) -> Hypothesis | None:
-    """Refits a model with effects in the priors that it had before they were widened.
+def own_priors_suffice(own: SegmentModel, model: Hypothesis, chosen: Hypothesis) -> bool:
+    """Returns whether a model with effects fits as well in priors that were not widened.
 
     Args:
         own: The model with these priors and without the effects, along the recording.
-        current: The closest fit of the model with effects and wider priors.
-        best: The best fit with wider priors, of any effects.
-
-    Returns:
-        The fit, or ``None`` if the best one with wider priors is clearly better.
+        model: The closest fit of the model with effects and wider priors.
+        chosen: The fit with wider priors, of the same or other effects, to compare it with.
     """
-    before, now = (wider_sites(model) for model in (own.model, current.segments.model))
+    before, now = (wider_sites(each) for each in (own.model, model.segments.model))
     names = {name for sites in now[len(before) :] for name in sites}
-    found = Trials(own).refitted(current)
-    if found is None or _gain(found, best) >= _threshold(names):
-        return None
-    return found
+    found = Trials(own).refitted(model)
+    return found is not None and _gain(found, chosen) < _threshold(names)
 
 
 def with_widest_priors(

@@ -56,8 +56,9 @@ class Search:
         final: The final model.
         added: Its effects.
         trials: The final model with each alternative in an effect's place, by the names of the
-            effect and of the alternative; ``""`` for the model without the effect. Those of one
-            place begin at the same initial states, so that their evidence can be compared.
+            effect and of the alternative; ``""`` for the model without the effect. The
+            alternatives of one place begin at the same initial states, so that their evidence can
+            be compared.
         is_approximate: Whether something remains that no law of the catalogue explains.
         has_stopped: Whether a time limit ended it before all was tried.
     """

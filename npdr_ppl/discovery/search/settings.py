@@ -67,9 +67,10 @@ class SearchSettings:
     """The rounds of the search.
 
     Attributes:
-        hopeless: Probability in coarse steps below which a candidate is not fitted again in finer
-            ones: a log evidence of −230. An error of the steps of 10 standard deviations, of which
-            the parameters absorb most, changes it by up to 10 √(2 · 230), less than itself.
+        hopeless: Probability in coarse steps, or with wider priors, below which a candidate is not
+            fitted again in finer steps or own priors: a log evidence of −230. An error of the
+            steps of 10 standard deviations, of which the parameters absorb most, changes it by up
+            to 10 √(2 · 230), less than itself.
         least_unexplained: Stop when the unexplained misfit is below this fraction of the explained
             misfit, over all channels and in those in which it is. If a large effect was missing,
             differences between integrators and in details of the laws are this large.
@@ -164,9 +165,10 @@ class TrialSettings:
             linear gain predicts, relative to the best candidate. On the tuning rigs it is at most
             3.4 for candidates that explain a tenth or more.
         certain_evidence: Difference of log evidence above which one of two hypotheses is taken as
-            certain.
+            certain. If finer steps change it by less, candidates are not screened again.
         enough_evidence: Log evidence for the best candidate, to first order, beyond which first
-            fits need no more segments: ten times what is certain.
+            fits need no more segments: ten times what is certain. The model without it is then far
+            off, and alternatives are compared along the best candidate's motion.
         fewest_segments: Least number of segments of these fits, in which all kinds of motion
             should occur.
     """

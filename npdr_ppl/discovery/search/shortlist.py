@@ -136,11 +136,11 @@ def fit_rivals(
 ) -> dict[str, Hypothesis]:
     """Fits the likeliest trials until convergence, all with the same initial states.
 
-    They are those along the motion of the model without the candidates, as in
-    :func:`fit_contenders`. Where one candidate explains very much, that model is far off, and so
-    are they. An alternative that can compensate for their errors then seems likelier than another
-    that cannot: behind stiff servos, a delay of all sensors than one of all commands. They are
-    then those along the motion of the likeliest trial.
+    The initial states are those of the model without the candidates, as in
+    :func:`fit_contenders`. If a candidate explains very much, they are estimated along the motion
+    of the likeliest trial. That model is then far off, and its initial states favour alternatives
+    that can compensate for their errors: behind stiff servos, a delay of all sensors over one of
+    all commands.
 
     Args:
         trials: Fits the model.
@@ -159,11 +159,16 @@ def fit_rivals(
     is_much = num < whole or (
         log_evidence(current, closest(list(tried.values()))) > TRIALS.enough_evidence
     )
-    found: dict[str, Hypothesis] = {}
+    names: list[str] = []
     if is_much:
-        names = _contenders(tried, TRIALS.most_converged)
-        begun = replace(_whole(trials, tried[names[0]], current), is_trial=True)
-        (best,) = trials.fits([begun], current.simulator)
+        # Short fits along all segments are no results if their initial states are others.
+        names = _contenders(tried, TRIALS.most_converged if num < whole else len(tried))
+    found: dict[str, Hypothesis] = {}
+    if names:
+        best: Hypothesis | None = tried[names[0]]
+        if num < whole:
+            begun = replace(_whole(trials, tried[names[0]], current), is_trial=True)
+            (best,) = trials.fits([begun], current.simulator)
         starts = None if best is None else best.estimated_starts()
         if starts is not None:
             asked = [_whole(trials, tried[name], current, starts) for name in names]
@@ -220,11 +225,8 @@ def fit_groups(
         are left out.
     """
     if groups:
-        evidence_of_all = _promised(current, groups[0].gain)
-        # Losses can be compared only with the same initial states.
+        evidence_of_all = max(_promised(current, groups[0].gain), log_evidence(current, compared))
         is_same = compared.segments.starts is current.segments.starts
-        if is_same:
-            evidence_of_all = max(evidence_of_all, log_evidence(current, compared))
         num = enough_segments(current, evidence_of_all)
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)

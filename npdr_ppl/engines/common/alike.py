@@ -130,7 +130,7 @@ def same_laws(
         """Returns one tree for all channels, whose tensors are joined."""
         return pytree.tree_map(
             lambda *leaves: (
-                torch.cat([leaf.expand(size) for leaf in leaves])
+                torch.cat([leaf.expand(size, *leaf.shape[1:]) for leaf in leaves])
                 if isinstance(leaves[0], Tensor)
                 else leaves[0]
             ),

@@ -93,8 +93,8 @@ class Bends:
         Args:
             column: The channel.
             changes: Differences of earlier true values from those at the start, latest first, by
-                channel. They were computed with a constant acceleration in each step, so that
-                rates have no bend there.
+                channel. Accelerations are taken as constant in each step, so that rates have no
+                bend there.
         """
         own = changes.get(column, ())
         if column in self._rates:

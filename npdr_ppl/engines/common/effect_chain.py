@@ -174,7 +174,7 @@ class EffectChain(ABC):
             past_motion: Motion of the joints before the start; ``None`` if it is unknown.
             is_held: Where the robot did not move before, ``(N,)``; ``None`` for nowhere.
             earlier: Positions, then velocities one step before, two steps before and so on, as far
-                as late measurements need them; empty to compute them from those at the start.
+                as effects on sensors need them; empty to compute them from those at the start.
         """
         begun = time - num_past * self.time_step
         joint_positions, joint_velocities = positions, velocities
@@ -226,7 +226,7 @@ class EffectChain(ABC):
 
             states = (*positions, *velocities)
             if earlier:
-                changes = changes_since(self.simulator, states, earlier, num_before)
+                changes = changes_since(self.simulator, states, earlier)
             else:
                 changes = earlier_changes(
                     self.simulator, states, accelerations, self.time_step, num_before

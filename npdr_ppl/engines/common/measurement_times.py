@@ -2,11 +2,12 @@
 
 A segment starts from measured states. If a sensor lags by d, it shows the state of d seconds ago,
 which is advanced by d under the recorded commands. During the first d seconds of the segment, such
-a sensor still reports values from before the segment: those on the way. Computed backwards from
-the segment's start, they would be useless where servos damp motions within milliseconds, because
-every error would grow as fast. States are moved in time with the simulator's own accelerations at
-the middle of each time span, without effects. A robot at rest at a rollout's first sample counts
-as held there before, so that nothing is moved.
+a sensor still reports values from before the segment: those on the way. Where only one of a
+position and its rate is late, and in episodes, they are computed backwards from the start instead.
+This is useless where servos damp motions within milliseconds, because every error grows as fast.
+States are moved in time with the simulator's own accelerations at the middle of each time span,
+without effects. A robot at rest at a rollout's first sample counts as held there before, so that
+nothing is moved.
 """
 
 import math
@@ -51,7 +52,9 @@ def catch_up(
     accelerations: Accelerations,
     leads: Sequence[Tensor | None],
     time_step: float,
+    *,
     num_parts: int = 1,
+    num_before: int = 0,
 ) -> tuple[Components, tuple[Components, ...]]:
     """Returns the present state, computed from states that were measured too early or too late.
 
@@ -64,17 +67,19 @@ def catch_up(
         leads: Lead of each state's measurement, in seconds; negative if it is late.
         time_step: Seconds per step.
         num_parts: In how many parts a step is computed.
+        num_before: How many earlier states are wanted.
 
     Returns:
-        The state, and the states one step before it, two steps before it and so on, as far as all
-        measurements reach back; the last ones are the measured ones. There are none if a position
-        is late and its rate is not, or the reverse: they have no common past on the way.
+        The state, and the states one step before it, two steps before it and so on. Before the
+        measured states, and for components that are not late, they are extrapolated. Empty if only
+        one of a position and its rate is late.
     """
-    passed = [states]
+    measured, passed = states, []
     ages = [None if lead is None else -lead for lead in leads]
     known = [age.detach() for age in ages if age is not None]
     oldest = max((float(age.max()) for age in known), default=0.0)
-    for step in range(-math.ceil(oldest / time_step), 0):
+    first = -math.ceil(oldest / time_step)
+    for step in range(first, 0):
         spans = [
             None if age is None else (age + (step + 1) * time_step).clamp(0.0, time_step)
             for age in ages
@@ -84,10 +89,55 @@ def catch_up(
             states = _moved(simulator, states, accelerations, step, ages, spans)
             ages = [_difference(age, span) for age, span in zip(ages, spans, strict=True)]
         if step < -1:
-            passed.append(states)
+            passed.insert(0, states)
     if any(float(age.min()) < 0.0 for age in known):
         states = _moved(simulator, states, accelerations, 0, ages, ages)
-    return states, tuple(reversed(passed)) if _are_together(simulator, leads) else ()
+    if not num_before or not _are_together(simulator, leads):
+        return states, ()
+    # Where damping is too fast for whole steps, an extrapolation along a line is more accurate.
+    curved = (lambda values, step: ()) if num_parts > 1 else accelerations
+    before_start = _extrapolation(simulator, states, curved(states, -1))
+    before_measured = _extrapolation(simulator, measured, curved(measured, min(first, -1)))
+    late = [None if lead is None else (-lead).clamp_min(0.0) for lead in leads]
+    earlier = []
+    for number in range(1, num_before + 1):
+        before = number * time_step
+        values = []
+        for i, age in enumerate(late):
+            value = before_start(i, states[i].new_tensor(before))
+            if age is not None:
+                value = torch.where(age > 0.0, before_measured(i, before - age), value)
+                if number <= len(passed):
+                    value = torch.where(age > before, passed[number - 1][i], value)
+            values.append(value)
+        earlier.append(tuple(values))
+    return states, tuple(earlier)
+
+
+def _extrapolation(
+    simulator: Simulator, states: Components, accelerations: Components
+) -> Callable[[int, Tensor], Tensor]:
+    """Returns a function of the number of a component and of a time: its value that long before.
+
+    Args:
+        simulator: The system.
+        states: Positions, then velocities.
+        accelerations: Rates of the velocities, constant over that time; empty for zero.
+    """
+    places = {state.name: i for i, state in enumerate(simulator.states)}
+    rate_of = {places.get(s.rate_of or ""): j for j, s in enumerate(simulator.states)}
+    by_state = dict(enumerate(accelerations, start=len(states) - len(accelerations)))
+
+    def value(number: int, time: Tensor) -> Tensor:
+        if number in by_state:
+            return states[number] - time * by_state[number]
+        rate = rate_of.get(number)
+        if rate is None:
+            return states[number] + torch.zeros_like(time)
+        moved = states[number] - time * states[rate]
+        return moved + 0.5 * time**2 * by_state[rate] if rate in by_state else moved
+
+    return value
 
 
 def _are_together(simulator: Simulator, leads: Sequence[Tensor | None]) -> bool:
@@ -121,28 +171,26 @@ def earlier_changes(
     for step in range(1, num_steps + 1):
         now = _moved(simulator, now, accelerations, -step, none, back)
         earlier.append(now)
-    return changes_since(simulator, states, earlier, num_steps)
+    return changes_since(simulator, states, earlier)
 
 
 def changes_since(
-    simulator: Simulator, states: Components, earlier: Sequence[Components], num_steps: int
+    simulator: Simulator, states: Components, earlier: Sequence[Components]
 ) -> dict[int, tuple[Tensor, ...]]:
     """Returns the differences of sensor values in earlier states, as :func:`earlier_changes` does.
 
     Args:
         simulator: The system.
         states: Positions, then velocities at the start, ``(N,)``.
-        earlier: The same one step before, two steps before and so on. The last ones hold for all
-            earlier steps.
-        num_steps: Number of steps before the start.
+        earlier: The same one step before, two steps before and so on.
     """
     names = [state.name for state in simulator.states]
     found = {}
     for column, sensor in enumerate(simulator.sensors):
         i = names.index(sensor.name) if sensor.name in names else None
-        steps = (earlier[min(step, len(earlier) - 1)] for step in range(num_steps))
         found[column] = tuple(
-            torch.zeros_like(states[0]) if i is None else values[i] - states[i] for values in steps
+            torch.zeros_like(states[0]) if i is None else values[i] - states[i]
+            for values in earlier
         )
     return found
 

@@ -62,9 +62,9 @@ class TrueStart(NamedTuple):
 
     Attributes:
         states: The state.
-        earlier: The state one step before, two steps before and so on, as far as late measurements
-            reach back. Components that are measured in time are those of the start. Empty if
-            positions and their rates are not equally late.
+        earlier: The state one step before, two steps before and so on, as far as effects on
+            sensors need them. Empty where they are to be computed backwards from the start; see
+            :mod:`~npdr_ppl.engines.common.measurement_times`.
     """
 
     states: Components
@@ -146,7 +146,7 @@ def true_start(
         records: Commands of each action channel.
     """
     if not chain.sensors.effects:
-        return TrueStart(recorded.states, (recorded.states,))
+        return TrueStart(recorded.states, ())
     states = chain.simulator.states
     places = {state.name: i for i, state in enumerate(states)}
     sensors = {sensor.name: i for i, sensor in enumerate(chain.simulator.sensors)}
@@ -170,7 +170,7 @@ def true_start(
     leads = sensor_leads(chain.sensors.effects, tables.effects, recorded.time)
     leads = {column: lead.where(~recorded.is_held, 0.0) for column, lead in leads.items()}
     if not leads:
-        return TrueStart(tuple(true), (tuple(true),))
+        return TrueStart(tuple(true), ())
     sources = (
         sensors.get((state.rate_of or "") if is_derived else state.name)
         for state, is_derived in zip(states, recorded.is_derived, strict=True)
@@ -182,9 +182,16 @@ def true_start(
         commands = commands_at(records, step)
         return chain.accelerations(states[:split], states[split:], commands, tables)
 
-    parts = chain.num_parts
     return TrueStart(
-        *catch_up(chain.simulator, tuple(true), accelerations, late, chain.time_step, parts)
+        *catch_up(
+            chain.simulator,
+            tuple(true),
+            accelerations,
+            late,
+            chain.time_step,
+            num_parts=chain.num_parts,
+            num_before=chain.sensors.num_before,
+        )
     )
 
 

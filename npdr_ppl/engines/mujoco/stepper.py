@@ -26,7 +26,7 @@ __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 ACCELERATION_STAGE = 3
 """Stage of sensors that depend on accelerations."""
 
-_MOST_DAMPED = 0.5
+_MOST_DAMPED_PER_PART = 0.5
 """Rate of the fastest damping, per part of a step, up to which the midpoint rule follows it: its
 decay over a part is then accurate to 3 %."""
 
@@ -123,7 +123,7 @@ class MujocoStepper(EffectChain):
         """In how many parts of a step late measurements are moved to the present."""
         simulator = self.simulator.rigid or self.simulator
         rate = fastest_damping(simulator.model, simulator.initial_positions)
-        return max(1, math.ceil(rate * self.time_step / _MOST_DAMPED))
+        return max(1, math.ceil(rate * self.time_step / _MOST_DAMPED_PER_PART))
 
     def start(self, *args: Any, **kwargs: Any) -> State:
         """Returns the state at the start of an episode or segment; see the base class."""
