@@ -159,26 +159,36 @@ def fit_rivals(
     is_much = num < whole or (
         log_evidence(current, closest(list(tried.values()))) > TRIALS.enough_evidence
     )
-    names: list[str] = []
-    if is_much:
-        # Short fits along all segments are no results if their initial states are others.
-        names = _contenders(tried, TRIALS.most_converged if num < whole else len(tried))
-    found: dict[str, Hypothesis] = {}
-    if names:
-        best: Hypothesis | None = tried[names[0]]
-        if num < whole:
-            begun = replace(_whole(trials, tried[names[0]], current), is_trial=True)
-            (best,) = trials.fits([begun], current.simulator)
-        starts = None if best is None else best.estimated_starts()
-        if starts is not None:
-            asked = [_whole(trials, tried[name], current, starts) for name in names]
-            progress(0.0, f"0 of {len(names)} best fits converged")
-            fits = trials.fits(asked, current.simulator)
-            for number, (name, longer) in enumerate(zip(names, fits, strict=True), 1):
-                if longer is not None and longer.can_be_linearised:
-                    found[name] = longer
-                progress(number / len(names), f"{number} of {len(names)} best fits converged")
-    return found or fit_contenders(trials, tried, current, progress=progress)
+    # Along all segments, no trial is left as it is, because its initial states are others.
+    most = TRIALS.most_converged if num < whole else len(tried)
+    names = _contenders(tried, most) if is_much else []
+    if not names:
+        return fit_contenders(trials, tried, current, progress=progress)
+    first, *others = names
+    best: Hypothesis | None = tried[first]
+    if num < whole:
+        begun = replace(_whole(trials, tried[first], current), is_trial=True)
+        (best,) = trials.fits([begun], current.simulator)
+    starts = None if best is None else best.estimated_starts()
+    if starts is not None:
+        progress(0.0, f"0 of {len(names)} best fits converged")
+        (best,) = trials.fits([_whole(trials, tried[first], current, starts)], current.simulator)
+    if starts is None or best is None or not best.can_be_linearised:
+        return fit_contenders(trials, tried, current, progress=progress)
+    found = {first: best}
+    progress(1 / len(names), f"1 of {len(names)} best fits converged")
+    # Where a joint sticks, there are several minima; from the same offsets, alike laws end in the
+    # same one.
+    asked = [
+        replace(_whole(trials, tried[name], current, starts), offsets=best.fit.offsets)
+        for name in others
+    ]
+    fits = trials.fits(asked, current.simulator)
+    for number, (name, longer) in enumerate(zip(others, fits, strict=True), 2):
+        if longer is not None:
+            found[name] = longer
+        progress(number / len(names), f"{number} of {len(names)} best fits converged")
+    return found
 
 
 def _whole(
