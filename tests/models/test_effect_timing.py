@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from npdr_ppl.language.effect_context import Start
+from npdr_ppl.language.effects import SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import (
     ActuatorLag,
@@ -214,6 +215,35 @@ def test_velocities_derived_from_readings_have_their_errors(effect, value):
     )
     if effect.id != "clock_skew":  # which the velocity's reading has as well
         torch.testing.assert_close(out[:, 1], fall * time[1:])
+
+
+class _LooksBack(SensorEffect):
+    """Reads the change of the value in the step before the segment, at its first reading."""
+
+    id = "looks_back"
+    needs_past = True
+    parameters = ()
+
+    def default_priors(self, port):
+        return {}
+
+    def history(self, parameters, time_step):
+        return 2
+
+    def initial_memory(self, value, reading, start):
+        return start.changes[0]
+
+    def read(self, value, parameters, memory, time_step):
+        return memory, memory
+
+
+def test_effects_that_need_the_past_get_it_where_nothing_is_late():
+    simulator = Pendulum(integrator="rk4").with_effects(_LooksBack("angle"))
+    out = replay(simulator, {}, [0.0], start=[1.0, 0.5], step=20)
+    short = replay(Pendulum(integrator="rk4"), {}, [0.0], start=[1.0, 0.5], time_step=1e-4)
+    step, acceleration = Pendulum.time_step, float(short[0, 1] - 0.5) / 1e-4
+    expected = -0.5 * step + 0.5 * acceleration * step**2
+    assert float(out[0, 0]) == pytest.approx(expected, rel=0.01)
 
 
 def test_a_closed_loop_reads_late():
