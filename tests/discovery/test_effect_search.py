@@ -12,7 +12,7 @@ from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.shortlist import (
     fit_contenders,
-    fit_rivals,
+    fit_likeliest,
     fit_shortlist,
     log_evidence,
 )
@@ -121,7 +121,9 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
     assert abs(losses[0] - losses[1]) < 1.0
 
 
-def test_rivals_of_a_candidate_that_explains_very_much_start_where_it_does(dragged, monkeypatch):
+def test_alternatives_to_a_candidate_that_explains_very_much_start_where_it_does(
+    dragged, monkeypatch
+):
     case, base = dragged
     laws = QuadraticDrag("hinge"), ViscousFriction("hinge"), Bias("hinge")
     searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=laws))
@@ -133,7 +135,7 @@ def test_rivals_of_a_candidate_that_explains_very_much_start_where_it_does(dragg
             shortlist.TRIALS, enough_evidence=evidence, most_converged=2, converged_loss=1000.0
         )
         monkeypatch.setattr(shortlist, "TRIALS", settings)
-        return fit_rivals(searcher.trials, tried, base)
+        return fit_likeliest(searcher.trials, tried, base)
 
     before, after = with_enough(1.1 * evidence), with_enough(0.9 * evidence)
     assert set(before) == set(tried)

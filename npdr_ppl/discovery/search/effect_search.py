@@ -23,7 +23,7 @@ from npdr_ppl.discovery.search.repeatability import repeated_effects
 from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
-from npdr_ppl.discovery.search.shortlist import fit_rivals, fit_shortlist, log_evidence
+from npdr_ppl.discovery.search.shortlist import fit_likeliest, fit_shortlist, log_evidence
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -150,19 +150,19 @@ class Searcher(OriginalModel):
             return ""
         likeliest = sorted(now.trials, key=lambda name: now.weights[name], reverse=True)
         # Others were not fitted to convergence, and would gain by that alone.
-        rivals = {
+        others = {
             name: now.trials[name]
             for name in likeliest[: TRIALS.most_converged]
             if set(now.trials[name].names) != set(current.names)
         }
-        for model in (current, *rivals.values()):
+        for model in (current, *others.values()):
             finer = self.with_finer_steps(model)
             if finer is not model:
                 is_much = log_evidence(model, finer) > TRIALS.certain_evidence
                 return "much" if is_much else "little"
         possible = (
-            self.trials.with_own_starts(rival)
-            for name, rival in rivals.items()
+            self.trials.with_own_starts(other)
+            for name, other in others.items()
             if now.weights[name] >= EVIDENCE.least_probability
         )
         return "little" if self.take_own_priors(current, possible) else ""
@@ -291,7 +291,7 @@ class Searcher(OriginalModel):
         if not trials:
             return None, {}, {}
         progress = self._progress.stage(label)
-        trials = fit_rivals(self.trials, trials, current, progress=progress)
+        trials = fit_likeliest(self.trials, trials, current, progress=progress)
         if not trials:
             return None, {}, {}
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))

@@ -152,7 +152,9 @@ class OriginalModel:
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
 
-    def take_own_priors(self, current: Hypothesis, rivals: Iterable[Hypothesis] = ()) -> bool:
+    def take_own_priors(
+        self, current: Hypothesis, alternatives: Iterable[Hypothesis] = ()
+    ) -> bool:
         """Takes the model's own priors again if they suffice with the effects that were added.
 
         A missing effect can move parameters beyond their priors. Once it is added, wider priors
@@ -160,8 +162,9 @@ class OriginalModel:
 
         Args:
             current: The best model with effects and wider priors.
-            rivals: Others that are possible. With one of all these, the own priors must be as good
-                as wider ones are with the best.
+            alternatives: Models with other effects in place of the last one that are possible,
+                too. With one of all these, the own priors must fit as well as wider ones do with
+                the best.
 
         Returns:
             Whether it has its own priors again.
@@ -172,7 +175,7 @@ class OriginalModel:
         for _ in range(num_finer_steps(self.base.model) - num_finer_steps(given)):
             given = with_finer_steps(given)
         own = self.base.with_model(given)
-        models = chain((current,), rivals)
+        models = chain((current,), alternatives)
         if not any(own_priors_suffice(own, model, current) for model in models):
             return False
         self._report("with the added effects, the model's own priors suffice")

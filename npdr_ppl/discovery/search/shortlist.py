@@ -21,7 +21,7 @@ __all__ = [
     "enough_segments",
     "fit_contenders",
     "fit_groups",
-    "fit_rivals",
+    "fit_likeliest",
     "fit_shortlist",
     "log_evidence",
 ]
@@ -127,7 +127,7 @@ def fit_contenders(
     return result
 
 
-def fit_rivals(
+def fit_likeliest(
     trials: Trials,
     tried: Mapping[str, Hypothesis],
     current: Hypothesis,
