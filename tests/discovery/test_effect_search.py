@@ -7,15 +7,12 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.search import rivals, shortlist
+from npdr_ppl.discovery.search import comparison, convergence, shortlist
+from npdr_ppl.discovery.search.comparison import compare_effects
+from npdr_ppl.discovery.search.convergence import converge_along_best, converge_likeliest
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.rivals import with_rivals
-from npdr_ppl.discovery.search.shortlist import (
-    fit_contenders,
-    fit_likeliest,
-    fit_shortlist,
-    log_evidence,
-)
+from npdr_ppl.discovery.search.evidence import log_evidence
+from npdr_ppl.discovery.search.shortlist import fit_shortlist
 from npdr_ppl.models.effects import (
     Bias,
     Cogging,
@@ -60,7 +57,7 @@ def test_every_effect_gets_its_own_alternatives(dragged):
     # The last one's were tried when it was added.
     tried = {"hinge.bias": all_three, "hinge.cogging": ripple}
     rounds = [searcher.look(searcher.fit_base()), replace(searcher.look(two), trials=tried)]
-    _, added, trials = with_rivals(all_three, rounds, searcher.trials, searcher.options)
+    _, added, trials = compare_effects(all_three, rounds, searcher.trials, searcher.options)
     assert [each.place for each in added] == [effect.name for effect in three]
     for effect in three:
         others = {other.name for other in three} - {effect.name}
@@ -75,8 +72,8 @@ def test_after_a_time_limit_effects_are_compared_with_nothing_new(dragged, monke
     options = npdr.DiscoveryOptions(effects=(*both, Bias("hinge")))
     searcher = Searcher(case.model, case.fit, options)
     found = fit_hypothesis(case.model, case.fit, searcher.data_options, effects=both)
-    monkeypatch.setattr(rivals, "find_alternatives", lambda *_, **__: 1 / 0)
-    _, added, _ = with_rivals(
+    monkeypatch.setattr(comparison, "find_alternatives", lambda *_, **__: 1 / 0)
+    _, added, _ = compare_effects(
         found, [searcher.look(base)], searcher.trials, options, stops=lambda: True
     )
     assert [each.alternatives for each in added] == [{e.name: 1.0} for e in both]
@@ -105,11 +102,11 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
 
     tried, sizes = with_enough(2.0 * evidence)
     assert sizes == {whole}
-    expected = fit_contenders(searcher.trials, tried, base)["hinge.quadratic_drag"]
+    expected = converge_likeliest(searcher.trials, tried, base)["hinge.quadratic_drag"]
     tried, sizes = with_enough(0.5 * evidence)
     assert sizes == {-(-whole // 2)}
     done = {"hinge.viscous_friction": searcher.trials.refitted(base, effects[1:])}
-    found = fit_contenders(
+    found = converge_likeliest(
         searcher.trials, {"hinge.quadratic_drag": tried["hinge.quadratic_drag"]}, base, done=done
     )
     assert set(found) == {"hinge.quadratic_drag", "hinge.viscous_friction"}
@@ -132,10 +129,10 @@ def test_alternatives_to_a_candidate_that_explains_very_much_start_where_it_does
 
     def with_enough(evidence):
         settings = replace(
-            shortlist.TRIALS, enough_evidence=evidence, most_converged=2, converged_loss=1000.0
+            convergence.TRIALS, enough_evidence=evidence, most_converged=2, converged_loss=1000.0
         )
-        monkeypatch.setattr(shortlist, "TRIALS", settings)
-        return fit_likeliest(searcher.trials, tried, base)
+        monkeypatch.setattr(convergence, "TRIALS", settings)
+        return converge_along_best(searcher.trials, tried, base)
 
     before, after = with_enough(1.1 * evidence), with_enough(0.9 * evidence)
     assert set(before) == set(tried)

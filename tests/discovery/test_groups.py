@@ -9,8 +9,9 @@ from npdr_ppl.discovery.screening.groups import ranked_pairs
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.screening import Screening
 from npdr_ppl.discovery.screening.sensitivities import sensitivities
+from npdr_ppl.discovery.search.convergence import converge_likeliest
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_groups, fit_shortlist
+from npdr_ppl.discovery.search.shortlist import fit_groups, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import (
     ActuatorLag,
@@ -134,7 +135,7 @@ def test_a_simple_law_converges_beside_three_laws_that_contain_it(rubbed, monkey
         return fits(self, wanted, simulator)
 
     monkeypatch.setattr(Trials, "fits", seen)
-    fit_contenders(searcher.trials, trials, first.hypothesis)
+    converge_likeliest(searcher.trials, trials, first.hypothesis)
     assert law.name in asked
 
 

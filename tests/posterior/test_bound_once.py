@@ -6,8 +6,9 @@ import pytest
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.search.convergence import converge_likeliest
 from npdr_ppl.discovery.search.effect_search import Searcher
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_shortlist
+from npdr_ppl.discovery.search.shortlist import fit_shortlist
 from npdr_ppl.inference.registry import backend
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.models.effects import Bias, CoulombFriction, QuadraticDrag
@@ -118,7 +119,7 @@ def test_refits_of_a_model_do_not_run_the_program_again(case, calls):
     trials = fit_shortlist(searcher.trials, base, ranking)
     number = 3 + len(trials)
     assert _number(calls, "traces") == number
-    trials = fit_contenders(searcher.trials, trials, base)
+    trials = converge_likeliest(searcher.trials, trials, base)
     number += len(trials)  # once more along all segments
     found = searcher.trials.with_own_starts(trials["hinge.quadratic_drag"])
     searcher.trials.holding(found, [{"hinge.quadratic_drag.coefficient": 1.0}])

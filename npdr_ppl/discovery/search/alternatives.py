@@ -12,16 +12,12 @@ from npdr_ppl.discovery.screening.projection import Projection, loss_without
 from npdr_ppl.discovery.screening.screening import screen
 from npdr_ppl.discovery.screening.settings import GENERIC_LAWS
 from npdr_ppl.discovery.screening.variants import candidates_at, variants_of
-from npdr_ppl.discovery.search.evidence import closest, weigh
+from npdr_ppl.discovery.search.convergence import converge_likeliest
+from npdr_ppl.discovery.search.evidence import closest, log_evidence, weigh
 from npdr_ppl.discovery.search.parsimony import overlap
 from npdr_ppl.discovery.search.repeatability import repetitions
 from npdr_ppl.discovery.search.settings import EVIDENCE
-from npdr_ppl.discovery.search.shortlist import (
-    enough_segments,
-    fit_contenders,
-    fit_shortlist,
-    log_evidence,
-)
+from npdr_ppl.discovery.search.shortlist import enough_segments, fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.language.effects import Effect
@@ -132,7 +128,7 @@ def find_alternatives(
     ]
     release_freed_memory()
     tried = fit_shortlist(trials, without, ranking)
-    tried = fit_contenders(trials, tried, without, done={effect.name: current})
+    tried = converge_likeliest(trials, tried, without, done={effect.name: current})
     others = {name: h for name, h in tried.items() if name != effect.name}
     return Alternatives(without, current, trials.apart_from_waves_in_step(others))
 

@@ -13,17 +13,18 @@ from npdr_ppl.discovery.screening.groups import Group, num_counted
 from npdr_ppl.discovery.screening.projection import loss_without
 from npdr_ppl.discovery.screening.variants import candidates_at
 from npdr_ppl.discovery.search.alternatives import Added, log_prior
+from npdr_ppl.discovery.search.comparison import compare_effects
+from npdr_ppl.discovery.search.convergence import converge_along_best
 from npdr_ppl.discovery.search.deadline import Deadline
-from npdr_ppl.discovery.search.evidence import weigh
+from npdr_ppl.discovery.search.evidence import log_evidence, weigh
 from npdr_ppl.discovery.search.likelier_group import likelier_group
 from npdr_ppl.discovery.search.look import look
 from npdr_ppl.discovery.search.original_model import OriginalModel
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.repeatability import repeated_effects
-from npdr_ppl.discovery.search.rivals import with_rivals
 from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
-from npdr_ppl.discovery.search.shortlist import fit_likeliest, fit_shortlist, log_evidence
+from npdr_ppl.discovery.search.shortlist import fit_shortlist
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -204,7 +205,7 @@ class Searcher(OriginalModel):
         trials: dict[tuple[str, str], Hypothesis] = {}
         is_approximate = False
         if current.effects and self._deadline.stops():
-            current, added, trials = self._with_rivals(current, rounds)
+            current, added, trials = self._compared(current, rounds)
             return Search(rounds, current, added, trials, has_stopped=True)
         for _ in range(SEARCH.most_revisions):
             current = repeated_effects(current, self.trials, self._report)
@@ -218,9 +219,7 @@ class Searcher(OriginalModel):
                 current = plausible_laws(
                     current, candidates, self.trials, self._report, most=max_effects
                 )
-            current, added, trials = self._with_rivals(
-                current, rounds, is_approximate=is_approximate
-            )
+            current, added, trials = self._compared(current, rounds, is_approximate=is_approximate)
             if current.effects and self._deadline.stops():
                 break
             kept = repeated_effects(current, self.trials, self._report)
@@ -232,11 +231,11 @@ class Searcher(OriginalModel):
         stopped = self._deadline.has_stopped
         return Search(rounds, current, added, trials, is_approximate, stopped)
 
-    def _with_rivals(
+    def _compared(
         self, current: Hypothesis, rounds: list[Round], *, is_approximate: bool = False
     ) -> tuple[Hypothesis, list[Added], dict[tuple[str, str], Hypothesis]]:
-        """Compares each effect with its alternatives; see :func:`with_rivals`."""
-        return with_rivals(
+        """Compares each effect with its alternatives; see :func:`compare_effects`."""
+        return compare_effects(
             current,
             rounds,
             self.trials,
@@ -291,7 +290,7 @@ class Searcher(OriginalModel):
         if not trials:
             return None, {}, {}
         progress = self._progress.stage(label)
-        trials = fit_likeliest(self.trials, trials, current, progress=progress)
+        trials = converge_along_best(self.trials, trials, current, progress=progress)
         if not trials:
             return None, {}, {}
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))

@@ -20,7 +20,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.permutation_tests import block_sums
 from npdr_ppl.discovery.search.settings import EVIDENCE
 
-__all__ = ["closest", "evidence", "weigh"]
+__all__ = ["closest", "evidence", "log_evidence", "weigh"]
 
 
 def closest(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
@@ -44,6 +44,17 @@ def evidence(
         blocks = -share * block_sums(hypothesis.losses(scale)[:, None])[:, 0]
         rows.append(blocks + (prior - hypothesis.complexity) / len(blocks))
     return torch.stack(rows)
+
+
+def log_evidence(current: Hypothesis, other: Hypothesis) -> float:
+    """Returns the log evidence for another hypothesis than the current one.
+
+    Args:
+        current: The current one.
+        other: The other one, along the same segments. The noise is what it leaves.
+    """
+    scale = other.fit.scale
+    return other.share * float((current.losses(scale) - other.losses(scale)).sum())
 
 
 def weigh(hypotheses: Sequence[Hypothesis], log_prior: Sequence[float]) -> list[float]:

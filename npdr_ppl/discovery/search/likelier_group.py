@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.groups import Group, num_counted
 from npdr_ppl.discovery.search.alternatives import log_prior
+from npdr_ppl.discovery.search.convergence import converge_likeliest
 from npdr_ppl.discovery.search.evidence import weigh
 from npdr_ppl.discovery.search.settings import SEARCH, TRIALS
-from npdr_ppl.discovery.search.shortlist import fit_contenders, fit_groups
+from npdr_ppl.discovery.search.shortlist import fit_groups
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.progress import Step
 
@@ -49,7 +50,7 @@ def likelier_group(
     if tried:
         tried = {
             name: trial
-            for name, trial in fit_contenders(
+            for name, trial in converge_likeliest(
                 trials, tried, current, done={"": current}, most=TRIALS.most_converged + 1
             ).items()
             if name

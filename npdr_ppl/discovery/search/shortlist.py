@@ -1,8 +1,7 @@
-"""Fits of the candidates of a round: short ones of many, then long ones of the likeliest."""
+"""Short fits of the most promising candidates, and of groups of them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -10,20 +9,16 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.groups import Group
 from npdr_ppl.discovery.screening.screening import Screened
-from npdr_ppl.discovery.search.evidence import closest, evidence
+from npdr_ppl.discovery.search.evidence import closest, log_evidence
 from npdr_ppl.discovery.search.settings import TRIALS
-from npdr_ppl.discovery.search.trials import Fit, Trials, refit
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.preparation.closest_fit import part_of
-from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.progress import Step
 
 __all__ = [
     "enough_segments",
-    "fit_contenders",
     "fit_groups",
-    "fit_likeliest",
     "fit_shortlist",
-    "log_evidence",
 ]
 
 
@@ -44,8 +39,8 @@ def fit_shortlist(
     so far are skipped. Candidates that cannot be simulated are left out.
 
     Where the best candidate explains very much, a part of the segments shows which candidates
-    explain most. The fits are then made along this part; :func:`fit_contenders` fits the best of
-    them along all segments.
+    explain most. The fits are then made along this part; the functions of
+    :mod:`npdr_ppl.discovery.search.convergence` fit the best of them along all segments.
 
     Args:
         trials: Fits the model.
@@ -62,150 +57,6 @@ def fit_shortlist(
             few, along = Trials(trials.base.along(index)), current.along(index)
             return _fit_each(few, along, ranking, report, progress, stops)
     return _fit_each(trials, current, ranking, report, progress, stops)
-
-
-def fit_contenders(
-    trials: Trials,
-    tried: Mapping[str, Hypothesis],
-    current: Hypothesis,
-    *,
-    done: Mapping[str, Hypothesis] | None = None,
-    most: int = TRIALS.most_converged,
-    progress: Step = lambda fraction, status: None,
-) -> dict[str, Hypothesis]:
-    """Fits the likeliest trials until convergence.
-
-    None is fitted whose loss is far above the least, that of models which are ``done`` included.
-
-    Args:
-        trials: Fits the model.
-        tried: The model with each of several effects, all along the same segments.
-        current: A model along all segments, whose initial states are used.
-        done: Models to compare them with whose fits have converged, along all segments.
-        most: Greatest number of fits that converge, with those of ``done`` that are likelier.
-        progress: Called with the fraction of these trials that has converged.
-
-    Returns:
-        The models along all segments, those that are ``done`` included. Trials that were made
-        along a part of the segments are left out unless they were fitted again.
-    """
-    result = dict(done or {})
-    if not tried:
-        return result
-    part = next(iter(tried.values())).segments
-    num_segments = current.segments.inputs.num_segments
-    is_part = part.inputs.num_segments < num_segments
-    known = result
-    if is_part:
-        index = part_of(current.segments, part.inputs.num_segments)
-        known = {name: hypothesis.along(index) for name, hypothesis in result.items()}
-    compared = {**known, **tried}
-    contenders = [name for name in _contenders(compared, most) if name in tried]
-    if not is_part:
-        result |= tried
-
-    def asked(name: str) -> Fit:
-        trial = tried[name]
-        if not is_part:
-            return refit(trial.segments, trial, trial.effects, {})
-        return _whole(trials, trial, current)
-
-    num = len(contenders)
-    progress(0.0, f"0 of {num} best fits converged")
-    fits = trials.fits([asked(name) for name in contenders], current.simulator)
-    for number, (name, longer) in enumerate(zip(contenders, fits, strict=True), 1):
-        if longer is not None:
-            result[name] = longer
-        progress(number / num, f"{number} of {num} best fits converged")
-    for name in _likeliest(compared):
-        if not is_part or not contenders or not result.keys().isdisjoint(contenders):
-            break
-        # None of the likeliest can be simulated along all segments.
-        if name in tried and name not in contenders:
-            (found,) = trials.fits([asked(name)], current.simulator)
-            result |= {} if found is None else {name: found}
-    return result
-
-
-def fit_likeliest(
-    trials: Trials,
-    tried: Mapping[str, Hypothesis],
-    current: Hypothesis,
-    *,
-    progress: Step = lambda fraction, status: None,
-) -> dict[str, Hypothesis]:
-    """Fits the likeliest trials until convergence, all with the same initial states.
-
-    The initial states are those of the model without the candidates, as in
-    :func:`fit_contenders`. If a candidate explains very much, they are estimated along the motion
-    of the likeliest trial. That model is then far off, and its initial states favour alternatives
-    that can compensate for their errors: behind stiff servos, a delay of all sensors over one of
-    all commands.
-
-    Args:
-        trials: Fits the model.
-        tried: The model with each of several effects, all along the same segments.
-        current: The model without them, along all segments.
-        progress: Called with the fraction of these trials that has converged.
-
-    Returns:
-        The models along all segments.
-    """
-    if not tried:
-        return {}
-    part = next(iter(tried.values())).segments
-    whole, num = current.segments.inputs.num_segments, part.inputs.num_segments
-    # A part is enough only where the best candidate explains very much.
-    is_much = num < whole or (
-        log_evidence(current, closest(list(tried.values()))) > TRIALS.enough_evidence
-    )
-    # Along all segments, no trial is left as it is, because its initial states are others.
-    most = TRIALS.most_converged if num < whole else len(tried)
-    names = _contenders(tried, most) if is_much else []
-    if not names:
-        return fit_contenders(trials, tried, current, progress=progress)
-    first, *others = names
-    best: Hypothesis | None = tried[first]
-    if num < whole:
-        begun = replace(_whole(trials, tried[first], current), is_trial=True)
-        (best,) = trials.fits([begun], current.simulator)
-    starts = None if best is None else best.estimated_starts()
-    if starts is not None:
-        progress(0.0, f"0 of {len(names)} best fits converged")
-        (best,) = trials.fits([_whole(trials, tried[first], current, starts)], current.simulator)
-    if starts is None or best is None or not best.can_be_linearised:
-        return fit_contenders(trials, tried, current, progress=progress)
-    found = {first: best}
-    progress(1 / len(names), f"1 of {len(names)} best fits converged")
-    # Where a joint sticks, there are several minima; from the same offsets, alike laws end in the
-    # same one.
-    asked = [
-        replace(_whole(trials, tried[name], current, starts), offsets=best.fit.offsets)
-        for name in others
-    ]
-    fits = trials.fits(asked, current.simulator)
-    for number, (name, longer) in enumerate(zip(others, fits, strict=True), 2):
-        if longer is not None:
-            found[name] = longer
-        progress(number / len(names), f"{number} of {len(names)} best fits converged")
-    return found
-
-
-def _whole(
-    trials: Trials, trial: Hypothesis, current: Hypothesis, starts: InitialStates | None = None
-) -> Fit:
-    """Returns the fit of a trial along all segments.
-
-    Args:
-        trials: Fits the model.
-        trial: The trial.
-        current: A model along all segments, whose initial states are used by default.
-        starts: Other initial states.
-    """
-    segments = trials.with_effects(trial.effects, starts or current.segments.starts)
-    assert segments is not None
-    offsets = current.fit.offsets if starts is None else segments.no_offsets
-    return refit(segments, trial, trial.effects, {}, offsets)
 
 
 def fit_groups(
@@ -317,42 +168,6 @@ def enough_segments(current: Hypothesis, evidence_of_all: float) -> int:
     return min(
         num, max(TRIALS.fewest_segments, math.ceil(num * TRIALS.enough_evidence / evidence_of_all))
     )
-
-
-def log_evidence(current: Hypothesis, other: Hypothesis) -> float:
-    """Returns the log evidence for another hypothesis than the current one.
-
-    Args:
-        current: The current one.
-        other: The other one, along the same segments. The noise is what it leaves.
-    """
-    scale = other.fit.scale
-    return other.share * float((current.losses(scale) - other.losses(scale)).sum())
-
-
-def _contenders(compared: Mapping[str, Hypothesis], most: int) -> list[str]:
-    """Returns the names of the likeliest models whose loss is not far above the least.
-
-    Args:
-        compared: Models along the same segments, by name.
-        most: Greatest number of names.
-    """
-    scale = closest(list(compared.values())).fit.scale
-    losses = {name: float(trial.losses(scale).sum()) for name, trial in compared.items()}
-    least = min(losses.values())
-    most_lost = max(TRIALS.converged_loss, TRIALS.converged_share * abs(least))
-    return [name for name in _likeliest(compared)[:most] if losses[name] <= least + most_lost]
-
-
-def _likeliest(tried: Mapping[str, Hypothesis]) -> list[str]:
-    """Returns the names of models along the same segments, the likeliest first.
-
-    By loss alone, laws with more parameters would crowd out the simple law they contain.
-    """
-    models = list(tried.values())
-    by_block = evidence(models, [0.0] * len(models), closest(models))
-    likelihood = dict(zip(tried, by_block.sum(-1).tolist(), strict=True))
-    return sorted(tried, key=lambda name: -likelihood[name])
 
 
 def _initial_guesses(candidate: Screened) -> list[dict[str, Tensor]]:

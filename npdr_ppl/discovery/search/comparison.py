@@ -20,10 +20,10 @@ from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.progress import Step
 
-__all__ = ["with_rivals"]
+__all__ = ["compare_effects"]
 
 
-def with_rivals(
+def compare_effects(
     current: Hypothesis,
     rounds: Sequence[Round],
     trials: Trials,
