@@ -4,15 +4,18 @@ import math
 from dataclasses import replace
 
 import pytest
+import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search import comparison, convergence, shortlist
+from npdr_ppl.discovery.search.alternatives import find_alternatives
 from npdr_ppl.discovery.search.comparison import compare_effects
 from npdr_ppl.discovery.search.convergence import converge_along_best, converge_likeliest
 from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.evidence import log_evidence
 from npdr_ppl.discovery.search.shortlist import fit_shortlist
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.models.effects import (
     Bias,
     Cogging,
@@ -116,6 +119,29 @@ def test_candidates_are_fitted_along_a_part_where_one_explains_very_much(dragged
         for trial in (found["hinge.quadratic_drag"], expected)
     ]
     assert abs(losses[0] - losses[1]) < 1.0
+
+
+def test_alternatives_begin_from_the_initial_states_of_the_model_with_the_effect(
+    dragged, monkeypatch
+):
+    case, base = dragged
+    laws = QuadraticDrag("hinge"), ViscousFriction("hinge"), Bias("hinge")
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=laws))
+    current = searcher.trials.refitted(base, laws[:1])
+    begun, fits = [], Trials.fits
+
+    def noted(self, asked, simulator):
+        begun.extend(fit.offsets for fit in asked)
+        return fits(self, asked, simulator)
+
+    monkeypatch.setattr(Trials, "fits", noted)
+    found = find_alternatives(current, laws[0], searcher.trials, searcher.options)
+    assert set(found.others) == {"hinge.viscous_friction"}
+    # Those of the model without the effect are far off, and lead to local minima.
+    assert not torch.equal(found.without.fit.offsets, current.fit.offsets)
+    assert len(begun) > 2  # without the effect, then short and long fits
+    # Short fits are made along a part of the segments.
+    assert all(bool(torch.isin(offsets, current.fit.offsets).all()) for offsets in begun)
 
 
 def test_alternatives_to_a_candidate_that_explains_very_much_start_where_it_does(

@@ -127,7 +127,7 @@ def find_alternatives(
         for candidate in ranking
     ]
     release_freed_memory()
-    tried = fit_shortlist(trials, without, ranking)
+    tried = fit_shortlist(trials, without, ranking, offsets=current.fit.offsets)
     tried = converge_likeliest(trials, tried, without, done={effect.name: current})
     others = {name: h for name, h in tried.items() if name != effect.name}
     return Alternatives(without, current, trials.apart_from_waves_in_step(others))

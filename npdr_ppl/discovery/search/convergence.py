@@ -26,12 +26,15 @@ def converge_likeliest(
     """Fits the likeliest trials until convergence.
 
     None is fitted whose loss is far above the least, that of models which are ``done`` included.
+    The offsets of the initial states begin at those of the closest of these. A model that lacks
+    much has others, from which a fit may end in a local minimum.
 
     Args:
         trials: Fits the model.
         tried: The model with each of several effects, all along the same segments.
         current: A model along all segments, whose initial states are used.
-        done: Models to compare them with whose fits have converged, along all segments.
+        done: Models to compare them with whose fits have converged, along all segments, with the
+            same initial states.
         most: Greatest number of fits that converge, with those of ``done`` that are likelier.
         progress: Called with the fraction of these trials that has converged.
 
@@ -54,11 +57,14 @@ def converge_likeliest(
     if not is_part:
         result |= tried
 
+    offsets = closest(list(done.values())).fit.offsets if done else None
+
     def asked(name: str) -> Fit:
         trial = tried[name]
         if not is_part:
-            return refit(trial.segments, trial, trial.effects, {})
-        return _whole(trials, trial, current)
+            return refit(trial.segments, trial, trial.effects, {}, offsets)
+        fit = _whole(trials, trial, current)
+        return fit if offsets is None else replace(fit, offsets=offsets)
 
     result |= _fitted(trials, {name: asked(name) for name in chosen}, progress)
     for name in _likeliest(compared):

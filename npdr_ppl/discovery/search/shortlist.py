@@ -29,6 +29,8 @@ def fit_shortlist(
     report: Callable[[str], None] = lambda _: None,
     progress: Step = lambda fraction, status: None,
     stops: Callable[[], bool] = lambda: False,
+    *,
+    offsets: Tensor | None = None,
 ) -> dict[str, Hypothesis]:
     """Fits the hypothesis with each candidate of the shortlist.
 
@@ -49,14 +51,18 @@ def fit_shortlist(
         report: Called with a sentence about each candidate.
         progress: Called with the fraction of the shortlist that is fitted.
         stops: Returns whether to leave out the candidates that are not fitted yet.
+        offsets: Initial guess of the offsets of the initial states, ``(S, m)``; those of the
+            hypothesis by default.
     """
+    if offsets is None:
+        offsets = current.fit.offsets
     if ranking:
         num = enough_segments(current, _promised(current, ranking[0].gain))
         if num < current.segments.inputs.num_segments:
             index = part_of(current.segments, num)
             few, along = Trials(trials.base.along(index)), current.along(index)
-            return _fit_each(few, along, ranking, report, progress, stops)
-    return _fit_each(trials, current, ranking, report, progress, stops)
+            return _fit_each(few, along, ranking, offsets[index], report, progress, stops)
+    return _fit_each(trials, current, ranking, offsets, report, progress, stops)
 
 
 def fit_groups(
@@ -113,6 +119,7 @@ def _fit_each(
     trials: Trials,
     current: Hypothesis,
     ranking: Sequence[Screened],
+    offsets: Tensor,
     report: Callable[[str], None],
     progress: Step,
     stops: Callable[[], bool],
@@ -131,8 +138,9 @@ def _fit_each(
             waiting[: TRIALS.candidates_per_decision],
             waiting[TRIALS.candidates_per_decision :],
         )
+        starts = current.segments.starts
         asked = [
-            (c, trials.extension(current, (c.variant.effect,), guess, current.segments.starts))
+            (c, trials.extension(current, (c.variant.effect,), guess, starts, offsets))
             for c in present
             for guess in _initial_guesses(c)
         ]

@@ -185,6 +185,7 @@ class Trials:
         added: tuple[Effect, ...],
         guess: Mapping[str, Tensor],
         starts: InitialStates | None,
+        offsets: Tensor | None = None,
     ) -> Fit | None:
         """Returns the short fit of a hypothesis with further effects from an initial guess.
 
@@ -193,13 +194,16 @@ class Trials:
             added: The further effects.
             guess: Initial guess of their parameters.
             starts: Initial states of the segments.
+            offsets: Initial guess of their offsets, ``(S, m)``; by default those of the
+                hypothesis, or none if it has other initial states.
         """
         effects = (*current.effects, *added)
         segments = self.with_effects(effects, starts)
         if segments is None:
             return None
-        is_same = starts is current.segments.starts
-        offsets = current.fit.offsets if is_same else segments.no_offsets
+        if offsets is None:
+            is_same = starts is current.segments.starts
+            offsets = current.fit.offsets if is_same else segments.no_offsets
         begin = {**current.parameters, **guess}
         return Fit(segments, effects, begin, offsets, is_trial=True)
 
