@@ -31,8 +31,10 @@ def scope(tmp_path_factory):
 
 
 def inputs(simulator, num_steps=5):
+    # Different ones, because equal thrusts do not turn a quadrotor.
+    actions = 0.4 + 0.1 * torch.arange(len(simulator.actions), dtype=torch.float64)
     return Inputs.single(
-        torch.full((num_steps, len(simulator.actions)), 0.4, dtype=torch.float64),
+        actions.expand(num_steps, -1),
         torch.full((len(simulator.states),), 0.3, dtype=torch.float64),
         action_names=tuple(action.name for action in simulator.actions),
         state_names=tuple(state.name for state in simulator.states),
@@ -41,7 +43,9 @@ def inputs(simulator, num_steps=5):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["arm", "lever", "falling", "pendulum", "cart_pole", "swinging"])
+@pytest.mark.parametrize(
+    "name", ["arm", "lever", "falling", "pendulum", "quadrotor", "cart_pole", "swinging"]
+)
 def test_every_simulator_of_the_page_depends_on_its_parameters(scope, name):
     simulator = scope[name]
     given = inputs(simulator, num_steps=60)

@@ -13,6 +13,7 @@ from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.engines.common.compilation import CompileMode
 from npdr_ppl.engines.common.effect_chain import needed_histories
 from npdr_ppl.engines.common.integrators import Components, Integrator, integrator
+from npdr_ppl.engines.ode.declaration import check_declaration
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effects import Effect, EnvironmentEffect
 
@@ -59,6 +60,7 @@ class MechanicalSystem(ClosedLoopSimulator):
             raise ModelError(f"{self.name} needs at least one substep, got {substeps=}.")
         if compile not in ("auto", "always", "never"):
             raise ModelError(f"compile is 'auto', 'always' or 'never', got {compile!r}.")
+        check_declaration(self)
         self.integrator: Integrator = _integrator(integrator or self.default_integrator)
         self.substeps = substeps
         self.compile: CompileMode = compile

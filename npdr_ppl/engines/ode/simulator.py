@@ -13,6 +13,7 @@ from npdr_ppl.engines.common.compilation import is_worthwhile, steps_per_call, w
 from npdr_ppl.engines.common.episodes import EpisodeRequest, Episodes
 from npdr_ppl.engines.common.integrators import integrator
 from npdr_ppl.engines.common.policy_loop import LoopBody, begin, run_compiled, run_eagerly
+from npdr_ppl.engines.ode.declaration import check_accelerations
 from npdr_ppl.engines.ode.mechanical_system import Forces, MechanicalSystem
 from npdr_ppl.engines.ode.recorded_actions import replay
 from npdr_ppl.engines.ode.stepping import Stepper
@@ -46,6 +47,8 @@ class ODESimulator(MechanicalSystem):
     is_finest: bool = False
     """Whether its steps cannot be refined further."""
 
+    _is_checked: bool = False
+
     def with_finer_steps(self) -> Self | None:
         """Returns a copy with finer steps; ``None`` if there are none.
 
@@ -74,7 +77,14 @@ class ODESimulator(MechanicalSystem):
         return changed
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
-        """Replays the inputs' actions; see :meth:`Simulator.simulate`."""
+        """Replays the inputs' actions; see :meth:`Simulator.simulate`.
+
+        Raises:
+            ModelError: The accelerations ask for an unknown constant, or ignore a force.
+        """
+        if not self._is_checked:
+            check_accelerations(self)
+            self._is_checked = True
         return replay(self, parameters, inputs)
 
     def run_episodes(self, request: EpisodeRequest) -> Episodes:
