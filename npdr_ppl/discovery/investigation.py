@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 
 from torch.distributions import Distribution
@@ -245,7 +246,7 @@ class Investigation:
             self.search.final,
             self.rollouts,
             self.holdout,
-            self._data_options,
+            self._searcher.found_options,
             seed=self.seed,
             progress=self.progress,
             is_approximate=self.search.is_approximate or self.search.has_stopped,
@@ -265,7 +266,7 @@ class Investigation:
         """
         search, holdout, options = self.search, self.holdout, None
         if holdout is not None:
-            options = held_out_options(self._short_options, self.rollouts, holdout)
+            options = held_out_options(self._found_short_options, self.rollouts, holdout)
         # With the steps and priors that the search ended with.
         original = search.rounds[0].hypothesis
         begun = [original, *([search.final] if search.added else [])]
@@ -285,6 +286,11 @@ class Investigation:
             number = [start is found.model.start for start in starts].index(True)
             return found.fitted_along(begun[number], self._searcher.trials)
 
+    @property
+    def _found_short_options(self) -> DataOptions:
+        before = self._searcher.found_options.commands_before
+        return replace(self._short_options, commands_before=before)
+
     def _in_short_segments(self, hypothesis: Hypothesis) -> Hypothesis:
         """Returns a model that is fitted to short segments; see :func:`short_segments`."""
         if self._short_options == self._data_options:
@@ -292,7 +298,7 @@ class Investigation:
         return fit_hypothesis(
             self.search.rounds[0].hypothesis.model,
             self.rollouts,
-            self._short_options,
+            self._found_short_options,
             effects=hypothesis.effects,
             start=hypothesis.parameters,
         )
@@ -305,7 +311,7 @@ class Investigation:
         names = self.start.segments.channel_names
         return PreparationSummary(
             self.rollouts,
-            self._data_options,
+            self._searcher.found_options,
             dict(zip(names, scale.tolist(), strict=True)),
             self._searcher.are_steps_coarse,
             likelihood.share,
@@ -335,7 +341,8 @@ class Investigation:
         with self.progress.timed("next experiment"):
             doubtful, advice = found.doubtful(self.settings), None
             if found.verdict == "ambiguous" and doubtful is not None:
-                advice = experiment_for(search, doubtful, self.rollouts, self._data_options)
+                options = self._searcher.found_options
+                advice = experiment_for(search, doubtful, self.rollouts, options)
             causes = surviving_causes(search, doubtful)
             self.progress.finish()
         return Discovery(

@@ -29,7 +29,7 @@ __all__ = ["keep_fits", "keeping", "made_or_read"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-VERSION = 9
+VERSION = 10
 """Raised when fits end elsewhere than before, so that those of earlier versions are not read."""
 
 _FOLDER: ContextVar[Path | None] = ContextVar("kept_fits", default=None)

@@ -38,7 +38,7 @@ class Inputs:
             itself (``recorded``) or a smoother's estimate (``estimated``).
         channel_names: Names of the C channels.
         past_actions: Commands of the H steps before each segment, oldest first, zero before the
-            rollout began, ``(..., S, H, A)``; delays need them.
+            rollout began, ``(..., S, H, A)``; delays need them. See ``began_in_operation``.
         time_step: Seconds between actions.
         mask: True for steps that exist, ``(S, K)``.
         rollout: Index of the rollout that each segment comes from, ``(S,)``.
@@ -60,6 +60,9 @@ class Inputs:
         is_zero: Whether the value, then the rate, of each channel is zero within two standard
             deviations of its error at the first sample of a rollout, ``(S, 2, C)``; false for
             other segments. ``None`` if the initial values say so exactly.
+        began_in_operation: Whether the first commands of a rollout had been acting before it, as
+            where a log was cut from a flight. Otherwise commands before it are zero. Servos held
+            their first goals in any case.
     """
 
     actions: Tensor
@@ -80,6 +83,7 @@ class Inputs:
     recorded_actions: Tensor | None = None
     recorded_readings: Tensor | None = None
     is_zero: Tensor | None = None
+    began_in_operation: bool = False
 
     def __post_init__(self) -> None:
         """Checks that the shapes match."""

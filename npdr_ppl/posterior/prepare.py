@@ -219,7 +219,7 @@ def prepare(
     )
     step(None, "compare with finer integration steps")
     finer = searcher.with_finer_steps(closest, is_rough=True)
-    closest = searcher.converged(finer)
+    closest = searcher.with_other_commands_before(searcher.converged(finer))
     base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)
     step(None, "check the priors")
     wider = searcher.with_wider_priors(finer)
@@ -241,7 +241,7 @@ def prepare(
         model if every is None else with_noise(model, every),
         model,
         repaired,
-        replace(options, segment_length=length),
+        replace(searcher.found_options, embedding=options.embedding),
         estimated,
         every,
         base.are_steps_coarse,

@@ -101,6 +101,10 @@ class DataOptions:
         noise: ``"auto"`` estimates the noise of a model that declares none, from the residuals of
             its closest fit, if initial states are uncertain; ``"model"`` keeps the model's noise.
         strict: Whether a recording with faults is refused instead of repaired.
+        commands_before: Commands before a rollout, which delays and lags need: ``"zero"``, the
+            ``"first"`` ones, as where a log was cut from a flight, or ``"auto"``, which
+            :func:`~npdr_ppl.preparation.commands_before.began_in_operation` decides. Servos held
+            their first goals in any case.
     """
 
     embedding: str | Embedding | None = "score"
@@ -109,6 +113,7 @@ class DataOptions:
     precision: Literal["float64", "float32"] = "float64"
     noise: Literal["auto", "model"] = "auto"
     strict: bool = False
+    commands_before: Literal["auto", "zero", "first"] = "auto"
 
     @property
     def dtype(self) -> torch.dtype:
@@ -123,7 +128,8 @@ class DataOptions:
 
     def every_segment(self, rollouts: Rollouts) -> Inputs:
         """Returns the inputs of all segments, from which whole rollouts can be stitched."""
-        return rollouts.inputs(self.steps(rollouts), self.initial_state, dtype=self.dtype)
+        inputs = rollouts.inputs(self.steps(rollouts), self.initial_state, dtype=self.dtype)
+        return replace(inputs, began_in_operation=self.commands_before == "first")
 
     def used_segments(self, rollouts: Rollouts) -> torch.Tensor:
         """Returns the indices of the segments that are used, among all of them."""

@@ -153,6 +153,7 @@ def estimate_starts(
         history=inputs.past_actions.shape[-2],
         dtype=inputs.actions.dtype,
     )
+    around = replace(around, began_in_operation=inputs.began_in_operation)
     places = inputs.start - around.start
     simulated = _simulated(box.simulator, box.parameters, around)
     predicted = _predicted(box.simulator, simulated, around)

@@ -24,6 +24,7 @@ from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.sites import SimulatorBlackBox
+from npdr_ppl.preparation.commands_before import began_in_operation
 from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
 from npdr_ppl.preparation.effective_share import effective_share
 from npdr_ppl.preparation.initial_states import (
@@ -80,6 +81,28 @@ class SegmentModel:
         self._cut = (options.every_segment if is_complete else options.inputs)(rollouts)
         self._trace(model)
         self._start_from(starts)
+        self._can_begin_otherwise = options.commands_before == "auto"
+        here = torch.zeros(1, self.prior.num_parameters, dtype=torch.float64)
+        if self._can_begin_otherwise and began_in_operation(self.black_box(here), self.inputs):
+            self._begin(is_in_operation=True)
+
+    def with_other_commands_before(self) -> "SegmentModel | None":
+        """Returns the model along a recording that began in operation if this one did not.
+
+        Or the other way round. ``None`` if the options say what was before.
+        """
+        if not self._can_begin_otherwise:
+            return None
+        other = copy.copy(self)
+        other._begin(is_in_operation=not self._cut.began_in_operation)
+        return other
+
+    def _begin(self, *, is_in_operation: bool) -> None:
+        self._cut, self._smoothed = (
+            replace(inputs, began_in_operation=is_in_operation)
+            for inputs in (self._cut, self._smoothed)
+        )
+        self._start_from(self.starts)
 
     def with_model(self, model: Model) -> "SegmentModel":
         """Returns another model along the same segments, with the same initial states.

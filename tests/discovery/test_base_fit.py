@@ -56,6 +56,6 @@ def test_a_rough_fit_is_fitted_to_convergence_once(monkeypatch):
     for module in (base_fit, original_model):
         monkeypatch.setattr(module, "polished", once)
     # As where rough fits do not show which steps are likelier.
-    monkeypatch.setattr(base_fit, "_are_likelier", lambda one, other: False)
+    monkeypatch.setattr(base_fit, "is_clearly_likelier", lambda one, other: False)
     settled = searcher.settled(given)
     assert len(finished) > 1 and any(settled is found for found in finished)

@@ -31,7 +31,15 @@ from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.preparation.settings import PRIOR_SEARCH
 from npdr_ppl.progress import Step
 
-__all__ = ["BaseFit", "fit_base", "in_finer_steps", "off_the_ends", "polished", "searched_fit"]
+__all__ = [
+    "BaseFit",
+    "fit_base",
+    "in_finer_steps",
+    "is_clearly_likelier",
+    "off_the_ends",
+    "polished",
+    "searched_fit",
+]
 
 
 @dataclass(frozen=True)
@@ -283,11 +291,11 @@ def in_finer_steps(
         if finer is not None and not is_rough:
             finer = off_the_ends(finer)
         is_finer_polished = False
-        if finer is not None and is_rough and not _are_likelier(finer, current):
+        if finer is not None and is_rough and not is_clearly_likelier(finer, current):
             # Rough fits do not show which is likelier.
             current = current if is_polished else polished(current)
             finer, is_polished, is_finer_polished = polished(finer), True, True
-        if finer is None or _are_likelier(current, finer):
+        if finer is None or is_clearly_likelier(current, finer):
             break
         report("the model's integration steps are too coarse for this recording; refining them")
         is_coarse, is_polished, bases = True, is_finer_polished, bases[number:]
@@ -314,9 +322,9 @@ def _in_finer_steps(segments: SegmentModel) -> SegmentModel | None:
     return segments.with_model(with_finer_steps(segments.model))
 
 
-def _are_likelier(one: Hypothesis, other: Hypothesis) -> bool:
-    """Returns whether the recording is clearly likelier with the steps of one hypothesis."""
-    return weigh([one, other], [0.0, 0.0])[0] > BASE_FIT.coarse_probability
+def is_clearly_likelier(one: Hypothesis, other: Hypothesis) -> bool:
+    """Returns whether the recording is clearly likelier with one of two hypotheses."""
+    return weigh([one, other], [0.0, 0.0])[0] > BASE_FIT.clear_probability
 
 
 def _distance(current: Hypothesis, difference: Tensor) -> float:

@@ -90,8 +90,7 @@ class Searcher(OriginalModel):
         Returns:
             The result; its first round has finer steps if they were needed.
         """
-        current, now = first.hypothesis, first
-        rounds = [first]
+        current, now, rounds = first.hypothesis, first, [first]
         # A round is tested only if the alarm of the one before fired. So only the first right
         # model can give a false alarm, and the number of rounds is not corrected for (compare
         # Marcus, Peritz & Gabriel 1976). ``benchmarks/discovery.py`` counts effects too many.
@@ -99,41 +98,58 @@ class Searcher(OriginalModel):
             # At least the likeliest candidates are fitted, so that there is an answer.
             if len(rounds) > 1 and self._deadline.stops():
                 break
-            best, weights, tried = self._extended(current, now)
-            rounds[-1] = replace(now, weights=weights, trials=tried)
-            single = current if best is None else tried[best]
-            if is_negligible(first.hypothesis, current, single):
-                single = current
-            changed = ""
-            if single is not current:
-                single = self.trials.with_own_starts(single)
-                changed = self._settle(single, rounds[-1])
-            if not changed:
-                likelier = self._with_law_at_several(rounds[-1], single)
-                extended = self._with_likelier_pair(rounds, likelier, max_effects)
-                is_new = extended is not single
-                if extended is current or (
-                    is_new and is_negligible(first.hypothesis, current, extended)
-                ):
-                    break
-                current = self._pruned(extended, None if is_new else best)
-                if current is not single:
-                    current = self.trials.with_own_starts(current)
-                changed = self._settle(current, rounds[-1]) if is_new else ""
+            extended, changed = self._with_another(rounds, max_effects)
             if changed:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
                 first = now = self._begun_again(rounds[0], looks=changed == "much")
                 current, rounds = first.hypothesis, [first]
                 continue
+            if extended is current:
+                break
+            current = extended
             if any(set(current.names) == set(r.hypothesis.names) for r in rounds):
                 break
             now = self.look(current)
             rounds.append(now)
         return self._revised(current, rounds, max_effects)
 
+    def _with_another(
+        self, rounds: list[Round], max_effects: int
+    ) -> tuple[Hypothesis, Literal["", "much", "little"]]:
+        """Adds what explains most to the last round's model, and removes what it replaces.
+
+        Args:
+            rounds: The results so far. What was tried is added to the last one.
+            max_effects: Greatest number of effects.
+
+        Returns:
+            The model, that of the last round if nothing explains enough; and what was changed with
+            it, see :meth:`_settle`.
+        """
+        first, current = rounds[0].hypothesis, rounds[-1].hypothesis
+        best, weights, tried = self._extended(current, rounds[-1])
+        rounds[-1] = replace(rounds[-1], weights=weights, trials=tried)
+        single = current if best is None else tried[best]
+        if is_negligible(first, current, single):
+            single = current
+        if single is not current:
+            single = self.trials.with_own_starts(single)
+            changed = self._settle(single, rounds[-1])
+            if changed:
+                return single, changed
+        likelier = self._with_law_at_several(rounds[-1], single)
+        extended = self._with_likelier_pair(rounds, likelier, max_effects)
+        is_new = extended is not single
+        if extended is current or (is_new and is_negligible(first, current, extended)):
+            return current, ""
+        result = self._pruned(extended, None if is_new else best)
+        if result is not single:
+            result = self.trials.with_own_starts(result)
+        return result, self._settle(result, rounds[-1]) if is_new else ""
+
     def _settle(self, current: Hypothesis, now: Round) -> Literal["", "much", "little"]:
-        """Takes finer steps if the present ones are too coarse, or own priors if they suffice.
+        """Takes finer steps, other commands before the recording, or own priors if needed.
 
         Errors of the steps differ between laws. A delayed command changes within a step, a late
         measurement does not: in coarse steps, the wrong one of the two can fit better. With wide
@@ -144,8 +160,9 @@ class Searcher(OriginalModel):
             now: The round that added the last one, with what it tried.
 
         Returns:
-            ``"much"`` if finer steps change the evidence so much that other candidates could now
-            explain most, ``"little"`` after any other change, empty if nothing was changed.
+            ``"much"`` if finer steps or other commands before the recording change the evidence so
+            much that other candidates could now explain most, ``"little"`` after any other change,
+            empty if nothing was changed.
         """
         if self._deadline.stops():
             return ""
@@ -161,6 +178,8 @@ class Searcher(OriginalModel):
             if finer is not model:
                 is_much = log_evidence(model, finer) > TRIALS.certain_evidence
                 return "much" if is_much else "little"
+            if self.with_other_commands_before(model, compared=current) is not model:
+                return "much"
         possible = (
             self.trials.with_own_starts(other)
             for name, other in others.items()

@@ -2,14 +2,20 @@
 
 import copy
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 from typing import Self
 
 from torch import Tensor
 
-from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.search.base_fit import fit_base, in_finer_steps, polished
+from npdr_ppl.discovery.hypothesis import Hypothesis, extended
+from npdr_ppl.discovery.search.base_fit import (
+    fit_base,
+    in_finer_steps,
+    is_clearly_likelier,
+    polished,
+)
 from npdr_ppl.discovery.search.prior_ends import own_priors_suffice, widen_where_it_helps
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
@@ -151,6 +157,45 @@ class OriginalModel:
         self.base, self.are_priors_widened = found.segments, True
         # The misfit caused by the narrow prior can hide that the steps are too coarse.
         return self.with_finer_steps(found.hypothesis)
+
+    @property
+    def found_options(self) -> DataOptions:
+        """How recordings are prepared, with the commands before them that were found."""
+        began = self.base.inputs.began_in_operation
+        return replace(self.data_options, commands_before="first" if began else "zero")
+
+    def with_other_commands_before(
+        self, current: Hypothesis, *, compared: Hypothesis | None = None
+    ) -> Hypothesis:
+        """Returns a hypothesis with other commands before the recording, if they are likelier.
+
+        Only delays and lags depend on them. If nothing is likelier, the hypothesis is unchanged.
+        All later hypotheses use the commands of the returned one.
+
+        Args:
+            current: A fitted hypothesis.
+            compared: The hypothesis than which it must be likelier; itself by default.
+        """
+        base = self.base.with_other_commands_before()
+        if base is None or not current.can_be_linearised:
+            return current
+        segments, z = extended(base, current.effects, current.segments.starts), current.fit.z[None]
+        likelihood = current.likelihood
+        gain = replace(likelihood, segments=segments).log_prob(z) - likelihood.log_prob(z)
+        if not float(gain) > 0.0:
+            return current
+        trials = Trials(base)
+        found = trials.refitted_along(segments, current, current.effects)
+        found = None if found is None else trials.with_own_starts(found)
+        if found is None or not is_clearly_likelier(found, compared or current):
+            return current
+        self._report(
+            "the first commands had been acting before the recording"
+            if base.inputs.began_in_operation
+            else "there were no commands before the recording"
+        )
+        self.base = base
+        return found
 
     def take_own_priors(
         self, current: Hypothesis, alternatives: Iterable[Hypothesis] = ()

@@ -32,8 +32,8 @@ class BaseFitSettings:
             standard deviations of the residuals. Above it, finer steps are used unless the
             recording contradicts them, because parameters or false effects would compensate for
             it. It is half of what an effect must change to be detected.
-        coarse_probability: Probability above which the recording itself is taken to be simulated
-            with coarse steps.
+        clear_probability: Probability above which a recording is clearly likelier with other
+            steps, or with other commands before it.
         most_refits: Greatest number of refits from inside the priors, each from the result of the
             previous one.
         least_gain: Least gain of such a refit in log density, a tenth of what makes one model ten
@@ -47,7 +47,7 @@ class BaseFitSettings:
     """
 
     noticeable_change: float = 2.5
-    coarse_probability: float = 0.9
+    clear_probability: float = 0.9
     most_refits: int = 4
     least_gain: float = 0.23
     num_linear_draws: int = 32
@@ -56,7 +56,7 @@ class BaseFitSettings:
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 0.0, 100.0, "noticeable_change", "least_gain")
-        check_range(self, 0.5, 1.0, "coarse_probability")
+        check_range(self, 0.5, 1.0, "clear_probability")
         check_range(self, 1, 100, "most_refits")
         check_range(self, 1, 10_000, "num_linear_draws")
         check_range(self, 0.0, 0.5, "largest_linear_error")

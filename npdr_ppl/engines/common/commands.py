@@ -22,8 +22,9 @@ __all__ = [
 class CommandRecord:
     """All commands of one action channel in a batch of segments, including past ones.
 
-    Commands before a rollout are zero, but a servo already holds the first goal. Commands before
-    the oldest one that is included of a running rollout are assumed equal to it.
+    Commands before a rollout are zero, but a servo already holds the first goal, and so does every
+    channel of a recording that began in operation. Commands before the oldest one that is included
+    of a running rollout are assumed equal to it.
 
     Attributes:
         table: Commands in time-major order, flat.
@@ -57,7 +58,7 @@ class CommandRecord:
         known = torch.cat((past, inputs.actions[..., column]), dim=-1)
         known = known.to(dtype).clamp(*limits)
         before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
-        if is_goal:
+        if is_goal or inputs.began_in_operation:
             first = (num_past - inputs.start).clamp_min(0)[..., None]
             goal = known.gather(-1, first.expand(*known.shape[:-1], 1))
             is_before = torch.arange(known.shape[-1], device=known.device) < first
