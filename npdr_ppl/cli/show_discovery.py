@@ -11,6 +11,7 @@ from rich.table import Table
 
 from npdr_ppl.cli.printing import console_for_tables, percent, print_notes, print_reason
 from npdr_ppl.drawing.effect_names import why_unnamed
+from npdr_ppl.drawing.experiment_words import values_that_differ
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["show_discovery"]
@@ -159,7 +160,9 @@ def _advice(experiment: Mapping[str, Any]) -> str:
     """Returns a next experiment in a sentence."""
     words = experiment["separated_by"]
     if experiment["excitation"] is None:
-        return words or "none of the tried excitations separates the alternatives."
+        ways = words or "none of the excitations that were tried separates the alternatives."
+        differing = values_that_differ(experiment)
+        return f"{ways.rstrip('.')}; measure {differing}." if differing else ways
     kind = experiment["excitation"]
     limits = ", ".join(f"{name} up to {v:.3g}" for name, v in experiment["amplitude"].items())
     sentence = (

@@ -6,7 +6,7 @@ The best experiment is the one with the largest minimum separation over all pair
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -40,12 +40,15 @@ class NextExperiment:
             measurements, by excitation; NaN if the simulation failed.
         amplitude: Greatest command, by action.
         separated_by: How to distinguish the alternatives, in words, if they are a known class.
+        differing: Parameters of the original model whose fitted values differ between the
+            alternatives, with these values, by name. To measure one tells the alternatives apart.
     """
 
     excitation: Excitation | None
     separations: dict[str, float]
     amplitude: dict[str, float]
     separated_by: str
+    differing: dict[str, list[float]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
         """Returns JSON-serialisable values."""
@@ -55,6 +58,7 @@ class NextExperiment:
             "separations": finite,
             "amplitude": self.amplitude,
             "separated_by": self.separated_by,
+            "differing": self.differing,
         }
 
 
@@ -101,9 +105,10 @@ def next_experiment(
         options: How it is cut into segments.
         classes: Equivalence classes of the alternatives' effects.
     """
-    largest = np.max([np.abs(actions).max(0) for actions in rollouts.actions], axis=0)
+    middle, largest = _ranges(rollouts)
     shapes = excitation_commands(rollouts.time_step)
-    commands = EXPERIMENT.safe_share * largest * np.stack(list(shapes.values()))[..., None]
+    waves = np.stack(list(shapes.values()))[..., None]
+    commands = middle + EXPERIMENT.safe_share * (largest - middle) * waves
     made = [_made(alternative, rollouts, commands) for alternative in alternatives]
     works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
     smallest = np.where(works, math.inf, math.nan)
@@ -123,7 +128,45 @@ def next_experiment(
         separations,
         dict(zip(rollouts.action_names, (EXPERIMENT.safe_share * largest).tolist(), strict=True)),
         "; ".join(dict.fromkeys(group.separated_by for group in classes)),
+        _differing(alternatives),
     )
+
+
+def _ranges(rollouts: Rollouts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns middle and greatest value of each command, ``(A,)``.
+
+    The middle is zero, unless all commands of the recording have the same sign, such as thrusts.
+    """
+    actions = np.concatenate(rollouts.actions)
+    low, high = actions.min(0), actions.max(0)
+    has_both = low * high <= 0.0
+    largest = np.where(has_both, np.maximum(high, -low), high)
+    return np.where(has_both, 0.0, 0.5 * (low + high)), largest
+
+
+def _differing(alternatives: Sequence[Hypothesis]) -> dict[str, list[float]]:
+    """Returns the values of the model's own parameters on which the alternatives disagree."""
+    if not all(hypothesis.can_be_linearised for hypothesis in alternatives):
+        return {}
+    own = {name for h in alternatives for effect in h.effects for name in effect.parameter_names}
+    spreads = []
+    for hypothesis in alternatives:
+        information = hypothesis.share * hypothesis.linearisation.information()
+        eye = torch.eye(len(information), dtype=torch.float64)
+        spreads.append(torch.linalg.inv(information + eye).diagonal().sqrt())
+    found: dict[str, list[float]] = {}
+    for site in alternatives[0].segments.prior.sites:
+        if site.name in own or site.shape.numel() != 1:
+            continue
+        places = [
+            next(s.coordinates for s in h.segments.prior.sites if s.name == site.name)
+            for h in alternatives
+        ]
+        z = torch.stack([h.fit.z[p] for h, p in zip(alternatives, places, strict=True)])
+        spread = torch.stack([s[p] for s, p in zip(spreads, places, strict=True)]).max()
+        if float(z.max() - z.min()) > EXPERIMENT.useful_separation * float(spread):
+            found[site.name] = [float(h.parameters[site.name]) for h in alternatives]
+    return found
 
 
 def excitation_commands(time_step: float) -> dict[str, NDArray[np.float64]]:
@@ -170,6 +213,7 @@ def _made(
         rollout=torch.arange(len(commands)),
         start=torch.zeros(len(commands), dtype=torch.long),
         initial_rates=torch.zeros_like(start),
+        began_in_operation=segments.inputs.began_in_operation,
         is_zero=torch.ones(len(commands), 2, start.shape[-1], dtype=torch.bool),
     )
     columns = [segments.sensor_names.index(name) for name in segments.channel_names]
@@ -204,26 +248,32 @@ def _separations(
 ) -> NDArray[np.float64]:
     """Returns the distance of each rollout of one hypothesis from the other, refitted to it.
 
-    The distance is NaN if the other hypothesis cannot be simulated there, and for rollouts of
-    which no segment is used.
+    Both are simulated from the same estimated initial states, so that their errors do not count.
+    The distance is NaN if one cannot be simulated there, and for rollouts of which no segment is
+    used.
     """
-    segments = SegmentModel(refitted.model, recorded, options)
-    fit = SegmentFit(refitted.fit.z, segments.no_offsets, made.fit.scale)
-    num = len(recorded.readings)
+    num, along = len(recorded.readings), []
+    for hypothesis in (made, refitted):
+        segments = SegmentModel(hypothesis.model, recorded, options)
+        fit = SegmentFit(hypothesis.fit.z, segments.no_offsets, made.fit.scale)
+        along.append(Hypothesis(hypothesis.model, hypothesis.effects, segments, fit))
     try:
-        projection = Projection(Hypothesis(refitted.model, refitted.effects, segments, fit))
+        projection = Projection(along[1])
+        difference = along[1].difference - along[0].difference
     except NpdrError:
         return np.full(num, math.nan)
+    segments = along[1].segments
+    change = segments.whitened(difference, made.fit.scale)[..., None]
 
     def by_rollout(values: Tensor) -> Tensor:
         result = values.new_zeros(num, *values.shape[1:])
         return result.index_add(0, segments.inputs.rollout, values)
 
-    score = by_rollout(projection.parameter_scores)
+    score = by_rollout(projection.explained_by_segment(change)[..., 0])
     prior = torch.eye(score.shape[-1], dtype=torch.float64)
     information = by_rollout(projection.parameter_information_by_segment) + prior
     explained = (score * torch.linalg.solve(information, score)).sum(-1)
-    left = by_rollout(projection.misfit_by_segment) - explained
+    left = by_rollout((change * projection.solve(change)).sum((-2, -1))) - explained
     is_used = torch.zeros(num, dtype=torch.bool)
     is_used[segments.inputs.rollout] = True
     return torch.where(is_used, left.clamp_min(0.0).sqrt(), math.nan).numpy()

@@ -18,6 +18,7 @@ from npdr_ppl.discovery.search.base_fit import (
 )
 from npdr_ppl.discovery.search.prior_ends import own_priors_suffice, widen_where_it_helps
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.language.effects import ActionEffect
 from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
@@ -177,7 +178,8 @@ class OriginalModel:
             compared: The hypothesis than which it must be likelier; itself by default.
         """
         base = self.base.with_other_commands_before()
-        if base is None or not current.can_be_linearised:
+        has_memory = any(isinstance(e, ActionEffect) for e in current.simulator.effects)
+        if base is None or not has_memory or not current.can_be_linearised:
             return current
         segments, z = extended(base, current.effects, current.segments.starts), current.fit.z[None]
         likelihood = current.likelihood

@@ -17,6 +17,7 @@ from npdr_ppl.display.reports.content import (
 )
 from npdr_ppl.drawing.bars_html import named_bars
 from npdr_ppl.drawing.effect_names import in_words
+from npdr_ppl.drawing.experiment_words import values_that_differ
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["next_section"]
@@ -96,6 +97,8 @@ def _experiment(experiment: Any) -> list[Part]:
         by = experiment.get("separated_by")
         hint = f" What separates them in general: {by}." if by else ""
         parts.append(TextPart(f"Next experiment, excitation: {words}.{hint}"))
+    if differing := values_that_differ(experiment):
+        parts.append(TextPart(f"The causes also differ in {differing}: measure it, if you can."))
     separations = experiment.get("separations")
     if isinstance(separations, Mapping):
         bars = {
@@ -109,7 +112,7 @@ def _experiment(experiment: Any) -> list[Part]:
             "them apart."
         )
         parts.append(DrawingPart(named_bars(bars, spec=".3g"), caption))
-    skipped = ("excitation", "separated_by", "separations", "amplitude")
+    skipped = ("excitation", "separated_by", "separations", "amplitude", "differing")
     rows = [[str(n), _words(v)] for n, v in experiment.items() if n not in skipped]
     amplitude = experiment.get("amplitude")
     if isinstance(amplitude, Mapping):
