@@ -68,10 +68,10 @@ class PreparationSummary:
                 "moving ones preferred"
             )
         starts = {
-            "uncertain": "estimated, uncertain initial states",
+            "uncertain": "initial states estimated with their errors",
             "estimated": "estimated initial states taken as true",
             "recorded": "recorded initial states taken as true",
         }[self.options.initial_state]
-        noise = "the model's own noise" if self.noise is None else "estimated noise"
+        noise = "the model's own noise" if self.noise is None else "noise estimated"
         steps = ", integration steps refined" if self.are_steps_coarse else ""
         return f"Prepared: {cut}, {starts}, {noise}{steps}."

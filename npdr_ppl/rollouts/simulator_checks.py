@@ -76,11 +76,13 @@ def check_channels(
                 f"actions=[{action.name!r}])."
             )
     missing = [a.name for a in actions if a.name not in recording.action_names]
-    missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in recorded]
+    # A rate follows from its position, which is named if it is missing itself.
+    known = recorded | {channel.name for channel in channels}
+    missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in known]
     found = ", ".join((*recording.channel_names, *recording.action_names))
     if missing:
         raise DataError(
-            f"the column {', '.join(missing)} is missing; the data have {found}. If a log has "
+            f"{_columns(missing)} missing; the data have {found}. If a log has "
             "other names, --mapping gives it the model's; npdr inspect LOG --model MODEL --write "
             "mapping.toml writes one to start from."
         )
@@ -90,9 +92,10 @@ def check_channels(
         expected = {channel.name for channel in channels}
         extra += [name for name in recording.channel_names if name not in expected]
     if extra:
+        it = "it" if len(extra) == 1 else "them"
         raise DataError(
-            f"the column {', '.join(extra)} is not expected; remove it, or give it the name of a "
-            f"channel of the model: {', '.join(c.name for c in (*channels, *actions))}."
+            f"{_columns(extra)} not expected; remove {it}, or give {it} the name of a channel of "
+            f"the model: {', '.join(c.name for c in (*channels, *actions))}."
         )
 
 
@@ -163,6 +166,12 @@ def limited_commands(recording: Recording, actions: Sequence[Channel]) -> tuple[
             )
         )
     return tuple(remarks)
+
+
+def _columns(names: Sequence[str]) -> str:
+    """Returns the names of columns as the subject of a sentence, with its verb."""
+    listed = ", ".join(names)
+    return f"the column {listed} is" if len(names) == 1 else f"the columns {listed} are"
 
 
 def _column(recording: Recording, name: str) -> list[NDArray[np.float64]]:

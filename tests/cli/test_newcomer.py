@@ -48,7 +48,7 @@ def degrees(text):
 
 
 MISTAKES = {
-    "wrong names": (renamed("angle,velocity", "q,dq"), "velocity is missing; the data have q, dq"),
+    "wrong names": (renamed("angle,velocity", "q,dq"), "the column angle is missing; the data"),
     "wrong name of time": (renamed("time", "t"), "there is no column time; the header is"),
     "a unit behind time": (renamed("time", "time [s]"), "no part of names, so rename 'time [s]'"),
     "wrong name of an action": (renamed("torque", "tau"), "the column torque is missing"),
@@ -180,7 +180,7 @@ def test_the_same_command_works_once_the_recording_is_repaired(monkeypatch, caps
     words += ["--segment-length", 10]
     data.write_text("\n".join([HEADER.replace("angle,velocity", "q,dq"), *map(",".join, rows())]))
     code, err = answered(monkeypatch, capsys, *words)
-    assert code == 2 and "angle, velocity is missing; the data have q, dq" in err
+    assert code == 2 and "the column angle is missing; the data have q, dq" in err
     data.write_text("\n".join([HEADER, *map(",".join, rows())]))
     code, err = answered(monkeypatch, capsys, *words)
     assert code == 0, err

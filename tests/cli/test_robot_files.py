@@ -152,7 +152,7 @@ def test_a_path_may_also_be_relative_to_the_working_directory(folder, tmp_path, 
         (
             "fit",
             "other.xml",
-            "the column motor, j, j_velocity is missing; the data have",
+            "the columns motor, j are missing; the data have",
         ),
         ("compare", "other.xml", "npdr inspect LOG --model MODEL --write"),
     ],

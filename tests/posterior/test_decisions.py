@@ -59,7 +59,7 @@ def test_a_complete_model_is_accepted_at_the_true_parameters(accepted):
         assert found.sample(500)[name].mean() == pytest.approx(value, rel=0.01)
     assert diagnosis["decision"] == Decision.ACCEPT, diagnosis["reason"]
     assert found.preparation.are_steps_coarse
-    assert "uncertain initial states" in found.preparation.summary.sentence()
+    assert "initial states estimated with their errors" in found.preparation.summary.sentence()
 
 
 @pytest.mark.slow

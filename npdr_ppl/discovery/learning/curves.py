@@ -72,6 +72,7 @@ def curves(model: LearnedModel) -> list[Curve]:
                 {},
                 {},
                 motion.values["t"],
+                torch.ones_like(motion.values["t"], dtype=torch.bool),
                 model.start.segments.inputs.rollout,
             )
             (found,) = latent_force(projection, known)

@@ -69,6 +69,8 @@ class Responses:
         channels: Simulated measurements, by channel, and commands, by action, at the beginning of
             each pulse, ``(S, pulses)``.
         time: Beginning of each pulse in seconds since the rollout began, ``(S, pulses)``.
+        is_recorded: Which pulses begin within a segment, ``(S, pulses)``; shorter segments are
+            padded.
         rollout: Index of each segment's rollout, ``(S,)``.
     """
 
@@ -78,6 +80,7 @@ class Responses:
     positions: dict[str, str]
     channels: dict[str, Tensor]
     time: Tensor
+    is_recorded: Tensor
     rollout: Tensor
 
 
@@ -143,7 +146,10 @@ def responses(hypothesis: Hypothesis) -> Responses:
     for k, name in enumerate(inputs.action_names):
         channels[name] = inputs.actions[:, begins, k].double()
     time = (inputs.start[:, None] + begins) * inputs.time_step
-    return Responses(by_port, units, rated, positions, channels, time.double(), inputs.rollout)
+    is_recorded = inputs.mask[:, begins]
+    return Responses(
+        by_port, units, rated, positions, channels, time.double(), is_recorded, inputs.rollout
+    )
 
 
 def _measuring(pulse: Pulse, port: Port, segments: SegmentModel) -> str | None:

@@ -244,7 +244,8 @@ def weigh_alternatives(
     chosen = next(e for e in swapped.effects if e.name == best)
     scale = closest([base, swapped]).fit.scale
     whole, lost = (float((h.losses(scale) - swapped.losses(scale)).sum()) for h in (base, without))
-    share = max(0.0, lost) / max(whole, 1e-12)
+    # Without it, the other effects can leave more than the original model does.
+    share = min(1.0, max(0.0, lost) / max(whole, 1e-12))
     excess = _excess_losses(trials, best)
     fitting = tuple(name for name, e in excess.items() if e < EVIDENCE.indistinct_loss)
     forms = tuple(

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from torch import Tensor
 
 from npdr_ppl.discovery.screening.latent_force import (
     LatentForce,
@@ -72,7 +73,7 @@ def plot_latent_force(
         axes = figure.subplots(len(ports), len(names), sharex="col", sharey="row", squeeze=False)
         for row, port in zip(axes, ports, strict=True):
             reach = [
-                _draw(axis, against[title][name], found[port], title)
+                _draw(axis, against[title][name], found[port], title, pushed[title].is_recorded)
                 for title, found in forces.items()
                 for axis, name in zip(row, names, strict=True)
                 if port in found
@@ -91,10 +92,11 @@ def plot_latent_force(
     return figure
 
 
-def _draw(axis: Axes, x: Array, found: LatentForce, title: str) -> float:
+def _draw(axis: Axes, x: Array, found: LatentForce, title: str, is_recorded: Tensor) -> float:
     """Draws one joint's force against one channel; returns the band's largest magnitude."""
-    force = found.force.numpy().ravel()
-    precision = found.error.numpy().ravel().clip(1e-12) ** -2.0
+    inside = is_recorded.numpy().ravel()
+    x, force = x[inside], found.force.numpy().ravel()[inside]
+    precision = found.error.numpy().ravel()[inside].clip(1e-12) ** -2.0
     few = np.random.default_rng(0).permutation(len(x))[:MOST_DOTS]
     axis.plot(
         x[few], force[few], ".", ms=1.5, alpha=0.4, color=LOOKS[title], rasterized=True, zorder=1

@@ -1,24 +1,28 @@
 """Checks of what the author of a mechanical system declared and wrote."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
+from torch import Tensor
 
+from npdr_ppl.engines.common.closed_loop_simulator import ClosedLoopSimulator
 from npdr_ppl.errors import ModelError
-
-if TYPE_CHECKING:
-    from npdr_ppl.engines.ode.mechanical_system import MechanicalSystem
 
 __all__ = ["check_accelerations", "check_declaration"]
 
 
-def check_declaration(system: "MechanicalSystem") -> None:
+def check_declaration(system: ClosedLoopSimulator, joints: Sequence[str]) -> None:
     """Checks joints, ports and the order of the states.
+
+    Args:
+        system: The system.
+        joints: Names of its force ports, one for each coordinate.
 
     Raises:
         ModelError: One of them does not fit the others; the message says how to mend it.
     """
-    name, joints = system.name, getattr(system, "joints", ())
+    name = system.name
     if not joints:
         raise ModelError(
             f"{name} declares no joints; name its force ports, one for each coordinate: "
@@ -42,15 +46,24 @@ def check_declaration(system: "MechanicalSystem") -> None:
         )
 
 
-def check_accelerations(system: "MechanicalSystem") -> None:
+def check_accelerations(
+    system: ClosedLoopSimulator,
+    joints: Sequence[str],
+    accelerations: Callable[..., tuple[Tensor, ...]],
+    constants: Any,
+) -> None:
     """Evaluates the accelerations once, at rest and with nominal parameters.
+
+    Args:
+        system: The system.
+        joints: Names of its force ports, one for each coordinate.
+        accelerations: Returns the acceleration of each joint.
+        constants: Its last argument, for nominal parameters.
 
     Raises:
         ModelError: They ask for a constant that does not exist, or ignore a force.
     """
-    values = system.nominal()
-    constants = system.constants(values, system.environment(values))
-    rest = tuple(torch.zeros(1, dtype=torch.float64) for _ in system.joints)
+    rest = tuple(torch.zeros(1, dtype=torch.float64) for _ in joints)
     actions = tuple(torch.zeros(1, dtype=torch.float64) for _ in system.actions)
     units = torch.eye(len(rest), dtype=torch.float64)
     try:
@@ -58,7 +71,7 @@ def check_accelerations(system: "MechanicalSystem") -> None:
             torch.stack(
                 [
                     torch.as_tensor(each, dtype=torch.float64).reshape(-1)[:1]
-                    for each in system.accelerations(
+                    for each in accelerations(
                         rest, rest, actions, tuple(force[None] for force in forces), constants
                     )
                 ]
@@ -70,7 +83,7 @@ def check_accelerations(system: "MechanicalSystem") -> None:
         raise ModelError(
             f"{system.name}.accelerations() asks for the constant {error}{known}."
         ) from error
-    for number, (joint, reached) in enumerate(zip(system.joints, pushed, strict=True)):
+    for number, (joint, reached) in enumerate(zip(joints, pushed, strict=True)):
         if bool((reached == free).all()):
             raise ModelError(
                 f"{system.name}.accelerations() ignores the force at {joint}; add "

@@ -60,7 +60,7 @@ class MechanicalSystem(ClosedLoopSimulator):
             raise ModelError(f"{self.name} needs at least one substep, got {substeps=}.")
         if compile not in ("auto", "always", "never"):
             raise ModelError(f"compile is 'auto', 'always' or 'never', got {compile!r}.")
-        check_declaration(self)
+        check_declaration(self, getattr(self, "joints", ()))
         self.integrator: Integrator = _integrator(integrator or self.default_integrator)
         self.substeps = substeps
         self.compile: CompileMode = compile

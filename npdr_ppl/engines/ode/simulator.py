@@ -83,7 +83,9 @@ class ODESimulator(MechanicalSystem):
             ModelError: The accelerations ask for an unknown constant, or ignore a force.
         """
         if not self._is_checked:
-            check_accelerations(self)
+            values = self.nominal()
+            constants = self.constants(values, self.environment(values))
+            check_accelerations(self, self.joints, self.accelerations, constants)
             self._is_checked = True
         return replay(self, parameters, inputs)
 
