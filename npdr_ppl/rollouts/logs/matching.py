@@ -78,7 +78,8 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
 
     Columns of a role that do not match are taken in the order of the log if there are as many
     signals of this role, and no name contradicts it. Numbers do not contradict, because some count
-    joints from 0 and others from 1. A measurement that never changes is no match.
+    joints from 0 and others from 1. A measurement that never changes is no match. Positions and
+    velocities that are left can match signals whose role their names do not tell.
 
     Args:
         columns: The columns.
@@ -102,7 +103,14 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
             own = [s for s in signals if s.role == "effort" and s.name not in taken]
             doubt = "may be a measurement"
         result |= _of_one_role(wanted, _in_order(own), doubt)
-    return result
+    taken = {match.signal.name for match in result.values()}
+    left = [c for c in columns if c.name not in result and c.role in ("position", "velocity")]
+    unclear = [
+        s for s in signals if s.role == "other" and not s.is_constant and s.name not in taken
+    ]
+    found = _by_name(left, unclear)
+    doubt = "its name does not say what it measures"
+    return result | {name: Match(signal, doubt) for name, signal in found.items()}
 
 
 def _of_one_role(

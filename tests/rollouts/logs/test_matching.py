@@ -129,3 +129,11 @@ def test_a_signal_with_the_name_of_a_column_is_that_column():
     assert matches["upper_arm_command"] == ("upper_arm_command", "")
     signals = [SignalSummary("shoulder", "", 0.0, 0.0, "other")]
     assert "shoulder" not in matched(COLUMNS, signals)  # it never changes
+
+
+def test_a_position_matches_a_name_that_does_not_say_what_it_measures():
+    columns = columns_of([Channel("x", "m"), Channel("pitch", "rad")], [])
+    assert found(columns, ["mocap_x", "mocap_y", "mocap_pitch_deg"]) == {
+        "x": ("mocap_x", "its name does not say what it measures"),
+        "pitch": ("mocap_pitch_deg", ""),
+    }
