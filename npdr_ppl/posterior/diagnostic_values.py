@@ -16,12 +16,16 @@ __all__ = [
     "conditional_contraction",
     "extreme",
     "leave_one_out",
+    "partners",
     "predictive_checks",
 ]
 
 FEWEST_FOR_INFLUENCE = 8
 """Least number of segments for the share of influential ones. With fewer segments, each one is
 influential."""
+
+STRONG_CORRELATION = 0.7
+"""Rank correlation from which half of a parameter's variance follows from the other one."""
 
 
 def conditional_contraction(groups: Mapping[str, "xr.Dataset"]) -> dict[str, float]:
@@ -33,6 +37,21 @@ def conditional_contraction(groups: Mapping[str, "xr.Dataset"]) -> dict[str, flo
     precision = np.linalg.pinv(covariance + 1e-12 * np.eye(len(labels)), hermitian=True)
     conditional = 1.0 / np.sqrt(np.maximum(np.diag(precision), np.finfo(float).tiny))
     return {name: float(1.0 - sd) for name, sd in zip(labels, conditional, strict=True)}
+
+
+def partners(groups: Mapping[str, "xr.Dataset"]) -> dict[str, list[str]]:
+    """Returns the others with which each parameter is strongly correlated, by rank."""
+    labels, posterior = _columns(groups["posterior"])
+    ranks = posterior.argsort(0).argsort(0)
+    correlation = np.atleast_2d(np.corrcoef(ranks, rowvar=False))
+    return {
+        name: [
+            other
+            for other, value in zip(labels, row, strict=True)
+            if other != name and abs(value) > STRONG_CORRELATION
+        ]
+        for name, row in zip(labels, correlation, strict=True)
+    }
 
 
 def _columns(dataset: "xr.Dataset") -> tuple[list[str], NDArray[np.float64]]:

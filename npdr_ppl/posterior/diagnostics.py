@@ -28,6 +28,7 @@ from npdr_ppl.posterior.diagnostic_values import (
     conditional_contraction,
     extreme,
     leave_one_out,
+    partners,
     predictive_checks,
 )
 from npdr_ppl.posterior.exported_checks import ATTRIBUTE
@@ -107,6 +108,7 @@ class Diagnosis:
         elpd_loo: Expected log predictive density over segments, and its standard error.
         pareto_k: Greatest Pareto k of a segment.
         conditional_contraction: Contraction given all other parameters.
+        partners: Of each parameter, the others with which it is strongly correlated.
         influential_share: Share of the segments whose Pareto k is above the limit.
         estimator_k: Pareto k of the posterior's draws, weighted by the simulator's likelihood;
             NaN if it was not computed.
@@ -126,6 +128,7 @@ class Diagnosis:
     elpd_loo: tuple[float, float]
     pareto_k: float
     conditional_contraction: Mapping[str, float] = field(default_factory=dict)
+    partners: Mapping[str, list[str]] = field(default_factory=dict)
     influential_share: float = float("nan")
     estimator_k: float = float("nan")
     model_p_value: float = float("nan")
@@ -179,6 +182,7 @@ def diagnose(
         elpd,
         k,
         conditional_contraction(groups),
+        partners(groups),
         influential,
         _number(estimator.get("pareto_k")),
         _number(model.get("p_value")),
@@ -352,10 +356,12 @@ class _Reading:
                 f"The recording says nothing of {_listed(alone)}: record a rollout that excites "
                 "the system more.",
             )
+        others = {p for n in unlearnt for p in self.figures.partners.get(n, ())} - set(unlearnt)
+        with_them = _listed(sorted(others)) if others else "other parameters"
         return (
             Decision.OTHER_EXCITATION,
-            f"The recording determines {_listed(unlearnt)} only in combination with other "
-            "parameters: record another excitation, or fix one of them.",
+            f"The recording determines {_listed(unlearnt)} only in combination with {with_them}: "
+            "record another excitation, or fix one of them.",
         )
 
     def _of_influence(self) -> tuple[Decision, str] | None:

@@ -4,10 +4,12 @@ import json
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import npdr_ppl as npdr
 from npdr_ppl.arviz_module import from_dict, group, group_names
 from npdr_ppl.errors import DataError
+from npdr_ppl.posterior.diagnostic_values import partners
 from npdr_ppl.posterior.diagnostics import Decision, Thresholds
 
 SEGMENTS, STEPS = 4, 25
@@ -228,3 +230,13 @@ def test_missing_groups_are_named():
     )
     with pytest.raises(DataError, match="posterior_predictive"):
         npdr.diagnose(data)
+
+
+def test_the_partners_of_a_parameter_are_those_it_is_strongly_correlated_with():
+    rng = np.random.default_rng(0)
+    arm, mass = rng.normal(size=(2, 1, 500))
+    inertia = np.exp(arm + 0.1 * rng.normal(size=(1, 500)))
+    values = {"arm": arm, "inertia": inertia, "mass": mass}
+    posterior = xr.Dataset({name: (("chain", "draw"), draws) for name, draws in values.items()})
+    found = partners({"posterior": posterior})
+    assert found == {"arm": ["inertia"], "inertia": ["arm"], "mass": []}
