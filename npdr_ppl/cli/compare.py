@@ -5,6 +5,8 @@ import typer
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.options import (
     BackendsOption,
+    CommandsBefore,
+    CommandsBeforeOption,
     DataOption,
     DeviceOption,
     EffectOption,
@@ -56,6 +58,7 @@ def compare(
     precision: PrecisionOption = Precision.FLOAT64,
     noise: NoiseOption = Noise.AUTO,
     strict: StrictOption = False,
+    commands_before: CommandsBeforeOption = CommandsBefore.AUTO,
     device: DeviceOption = "cpu",
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
@@ -88,7 +91,9 @@ def compare(
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     named = candidates(split_candidates(backends))
-    options = data_options(embedding, segment_length, initial_state, precision, noise, strict)
+    options = data_options(
+        embedding, segment_length, initial_state, precision, noise, strict, commands_before
+    )
     train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     with (
         resumable(f"the same command again continues the comparison in {out}."),

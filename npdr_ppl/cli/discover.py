@@ -8,6 +8,8 @@ import typer
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.names import complete_effect
 from npdr_ppl.cli.options import (
+    CommandsBefore,
+    CommandsBeforeOption,
     DataOption,
     EffectOption,
     HoldoutDataOption,
@@ -75,6 +77,7 @@ def discover(
     precision: PrecisionOption = Precision.FLOAT64,
     noise: NoiseOption = Noise.AUTO,
     strict: StrictOption = False,
+    commands_before: CommandsBeforeOption = CommandsBefore.AUTO,
     max_effects: Annotated[int, typer.Option(min=0, help="Maximum number of effects to add.")] = 5,
     false_alarm_rate: Annotated[
         float, typer.Option(help="Probability of an alarm if nothing is missing.")
@@ -143,7 +146,9 @@ def discover(
 
     chosen = resolve_effects(resolve_model(model), effect or [])
     train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
-    options = data_options(None, segment_length, initial_state, precision, noise, strict)
+    options = data_options(
+        None, segment_length, initial_state, precision, noise, strict, commands_before
+    )
     named = [word for word in candidates or () if word]
     search = DiscoveryOptions(
         effects=tuple(named_effects(named)) or None,

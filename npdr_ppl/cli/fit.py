@@ -7,6 +7,8 @@ import typer
 from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.options import (
     BackendOption,
+    CommandsBefore,
+    CommandsBeforeOption,
     DataOption,
     DeviceOption,
     EffectOption,
@@ -61,6 +63,7 @@ def fit(
     precision: PrecisionOption = Precision.FLOAT64,
     noise: NoiseOption = Noise.AUTO,
     strict: StrictOption = False,
+    commands_before: CommandsBeforeOption = CommandsBefore.AUTO,
     device: DeviceOption = "cpu",
     executor: ExecutorOption = None,
     workers: WorkersOption = None,
@@ -91,7 +94,9 @@ def fit(
     device = resolve_device(device)
     chosen = resolve_effects(resolve_model(model), effect or [])
     method, features = resolve_backend(backend, embedding)
-    options = data_options(features, segment_length, initial_state, precision, noise, strict)
+    options = data_options(
+        features, segment_length, initial_state, precision, noise, strict, commands_before
+    )
     train, test = resolve_rollouts(data, holdout, holdout_data=holdout_data, mapping=mapping)
     with (
         resumable(f"the same command again continues the run in {out}."),

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 __all__ = [
     "BackendOption",
     "BackendsOption",
+    "CommandsBefore",
+    "CommandsBeforeOption",
     "DataOption",
     "DeviceOption",
     "EffectOption",
@@ -78,6 +80,14 @@ class Noise(StrEnum):
 
     AUTO = "auto"
     MODEL = "model"
+
+
+class CommandsBefore(StrEnum):
+    """Commands before a rollout."""
+
+    AUTO = "auto"
+    ZERO = "zero"
+    FIRST = "first"
 
 
 _DATA = typer.Option(
@@ -175,6 +185,12 @@ NoiseOption = Annotated[
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="Refuse a recording with faults instead of repairing it.")
 ]
+CommandsBeforeOption = Annotated[
+    CommandsBefore,
+    typer.Option(
+        help="Commands before a rollout, for delays and lags: zero, the first ones, or auto."
+    ),
+]
 DeviceOption = Annotated[str, typer.Option(help="Where to train: cpu or cuda.")]
 
 
@@ -185,6 +201,7 @@ def data_options(
     precision: Precision,
     noise: Noise,
     strict: bool = False,
+    commands_before: CommandsBefore = CommandsBefore.AUTO,
 ) -> "DataOptions":
     """Returns how a command prepares rollouts.
 
@@ -200,6 +217,7 @@ def data_options(
         precision.value,
         noise.value,
         strict,
+        commands_before.value,
     )
 
 

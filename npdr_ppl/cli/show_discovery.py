@@ -11,7 +11,7 @@ from rich.table import Table
 
 from npdr_ppl.cli.printing import console_for_tables, percent, print_notes, print_reason
 from npdr_ppl.drawing.effect_names import why_unnamed
-from npdr_ppl.drawing.experiment_words import values_that_differ
+from npdr_ppl.drawing.experiment_words import ranges_of_commands, values_that_differ
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["show_discovery"]
@@ -164,10 +164,9 @@ def _advice(experiment: Mapping[str, Any]) -> str:
         differing = values_that_differ(experiment)
         return f"{ways.rstrip('.')}; measure {differing}." if differing else ways
     kind = experiment["excitation"]
-    limits = ", ".join(f"{name} up to {v:.3g}" for name, v in experiment["amplitude"].items())
     sentence = (
-        f"{kind.replace('_', ' ')} with {limits}, which separates the alternatives by "
-        f"{experiment['separations'][kind]:.0f} standard deviations"
+        f"{kind.replace('_', ' ')} with {ranges_of_commands(experiment)}, which separates the "
+        f"alternatives by {experiment['separations'][kind]:.0f} standard deviations"
     )
     return f"{sentence}; {words}" if words else f"{sentence}."
 

@@ -9,6 +9,8 @@ from npdr_ppl.cli.manners import AsJson, Quiet, Verbose, resumable
 from npdr_ppl.cli.names import complete_search, complete_target, complete_task
 from npdr_ppl.cli.options import (
     BackendOption,
+    CommandsBefore,
+    CommandsBeforeOption,
     EffectOption,
     EmbeddingOption,
     InitialState,
@@ -84,6 +86,7 @@ def train(
     precision: PrecisionOption = Precision.FLOAT32,
     noise: NoiseOption = Noise.AUTO,
     strict: StrictOption = False,
+    commands_before: CommandsBeforeOption = CommandsBefore.AUTO,
     search_iterations: Annotated[
         int, typer.Option(min=1, help="Iterations of each policy search.")
     ] = 20,
@@ -177,7 +180,9 @@ def train(
         )
     if animate:
         check_animated([sensor.name for sensor in device.sensors])
-    options = data_options(features, segment_length, initial_state, precision, noise, strict)
+    options = data_options(
+        features, segment_length, initial_state, precision, noise, strict, commands_before
+    )
     loop = LoopOptions(
         iterations=iterations,
         rollouts=rollouts,

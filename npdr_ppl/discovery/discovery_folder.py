@@ -81,6 +81,7 @@ class DiscoveryFolder:
             "effects": search.effects and [repr(effect) for effect in search.effects],
             "segment_length": options.segment_length,
             "precision": options.precision,
+            "commands_before": options.commands_before,
         }
         description = plain(
             {

@@ -98,6 +98,7 @@ class Judge:
         self._options = DataOptions(
             embedding=None,
             initial_state="recorded",  # they are set by _starts
+            commands_before="zero",
             segment_length=known.segment_length or self._default_length(),
         )
         shape = (PLANNING.num_noises, limits.num_steps + 1, len(self.channels))

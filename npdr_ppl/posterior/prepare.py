@@ -219,11 +219,19 @@ def prepare(
     )
     step(None, "compare with finer integration steps")
     finer = searcher.with_finer_steps(closest, is_rough=True)
-    closest = searcher.with_other_commands_before(searcher.converged(finer))
+    converged = searcher.converged(finer)
+    closest = searcher.with_likelier_commands_before(converged)
+    finer = finer if closest is converged else closest
     base = BaseFit(searcher.base, closest, searcher.are_steps_coarse)
     step(None, "check the priors")
     wider = searcher.with_wider_priors(finer)
-    wider = closest if wider is finer else wider
+    if wider is finer:
+        wider = closest
+    else:
+        # A narrow prior can hide which commands are likelier.
+        wider = searcher.with_likelier_commands_before(wider)
+        closest = searcher.under_commands_found(closest)
+        base = replace(base, segments=closest.segments, hypothesis=closest)
     ends = ()
     if searcher.are_priors_widened:
         ends = beyond(base.hypothesis.segments.prior.distributions, wider)

@@ -103,8 +103,12 @@ class DataOptions:
         strict: Whether a recording with faults is refused instead of repaired.
         commands_before: Commands before a rollout, which delays and lags need: ``"zero"``, the
             ``"first"`` ones, as where a log was cut from a flight, or ``"auto"``, which
-            :func:`~npdr_ppl.preparation.commands_before.began_in_operation` decides. Servos held
-            their first goals in any case.
+            :func:`~npdr_ppl.preparation.commands_before.began_in_operation` decides if initial
+            states are uncertain, and otherwise is ``"zero"``. Servos held their first goals in any
+            case.
+
+    Raises:
+        DataError: ``commands_before`` is none of these.
     """
 
     embedding: str | Embedding | None = "score"
@@ -114,6 +118,14 @@ class DataOptions:
     noise: Literal["auto", "model"] = "auto"
     strict: bool = False
     commands_before: Literal["auto", "zero", "first"] = "auto"
+
+    def __post_init__(self) -> None:
+        """Checks the commands before a rollout."""
+        if self.commands_before not in ("auto", "zero", "first"):
+            raise DataError(
+                "commands_before is 'auto', 'zero' or 'first', which were the commands before a "
+                f"rollout; got {self.commands_before!r}."
+            )
 
     @property
     def dtype(self) -> torch.dtype:

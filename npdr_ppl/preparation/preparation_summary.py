@@ -74,4 +74,6 @@ class PreparationSummary:
         }[self.options.initial_state]
         noise = "the model's own noise" if self.noise is None else "noise estimated"
         steps = ", integration steps refined" if self.are_steps_coarse else ""
-        return f"Prepared: {cut}, {starts}, {noise}{steps}."
+        held = self.options.commands_before == "first"
+        before = ", first commands held before each rollout" if held else ""
+        return f"Prepared: {cut}, {starts}, {noise}{before}{steps}."

@@ -81,26 +81,29 @@ class SegmentModel:
         self._cut = (options.every_segment if is_complete else options.inputs)(rollouts)
         self._trace(model)
         self._start_from(starts)
-        self._can_begin_otherwise = options.commands_before == "auto"
+        self._has_guessed_commands = (
+            options.commands_before == "auto" and options.initial_state == "uncertain"
+        )
         here = torch.zeros(1, self.prior.num_parameters, dtype=torch.float64)
-        if self._can_begin_otherwise and began_in_operation(self.black_box(here), self.inputs):
-            self._begin(is_in_operation=True)
+        if self._has_guessed_commands and began_in_operation(self.black_box(here), self.inputs):
+            self._set_began_in_operation(True)
 
     def with_other_commands_before(self) -> "SegmentModel | None":
         """Returns the model along a recording that began in operation if this one did not.
 
-        Or the other way round. ``None`` if the options say what was before.
+        Or the other way round. ``None`` if the options say what was before, or if this is already
+        the other way round than was guessed at first.
         """
-        if not self._can_begin_otherwise:
+        if not self._has_guessed_commands:
             return None
         other = copy.copy(self)
-        other._begin(is_in_operation=not self._cut.began_in_operation)
+        other._has_guessed_commands = False
+        other._set_began_in_operation(not self._cut.began_in_operation)
         return other
 
-    def _begin(self, *, is_in_operation: bool) -> None:
+    def _set_began_in_operation(self, began: bool) -> None:
         self._cut, self._smoothed = (
-            replace(inputs, began_in_operation=is_in_operation)
-            for inputs in (self._cut, self._smoothed)
+            replace(inputs, began_in_operation=began) for inputs in (self._cut, self._smoothed)
         )
         self._start_from(self.starts)
 

@@ -56,12 +56,18 @@ def test_a_declaration_that_does_not_fit_is_refused(attributes, sentence):
     [
         (lambda *a: (a[3][0] / a[5]["weight"],), "asks for the constant 'weight'; it has mass"),
         (lambda *a: (a[3][0] / a[5]["mass"],), r"ignores the force at rail; add forces\[0\]"),
+        (lambda *a: (a[4][0], a[4][0]), "returns 2 accelerations for 1 joints"),
     ],
 )
 def test_accelerations_are_tried_out_before_the_first_simulation(law, sentence):
     simulator = changed(accelerations=law)()
     with pytest.raises(ModelError, match=sentence):
         simulated(simulator)
+
+
+def test_other_faults_of_accelerations_are_seen_in_the_simulation():
+    with pytest.raises(KeyError, match="gain"):
+        simulated(changed(accelerations=lambda *a: ({}["gain"],))())
 
 
 def test_a_correct_system_is_simulated():

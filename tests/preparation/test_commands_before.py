@@ -11,8 +11,11 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_segment_model
 from npdr_ppl.discovery.search.original_model import OriginalModel
+from npdr_ppl.errors import DataError
 from npdr_ppl.language.handlers import add_effect
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.models.effects import ActuatorLag
+from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel
 
@@ -90,6 +93,8 @@ def test_a_recording_began_in_operation_where_its_first_commands_kept_it_at_rest
     hovering = recording(GRAVITY, before=GRAVITY)
     assert begins_in_operation(Lift(), hovering)
     assert not begins_in_operation(Lift(), hovering, commands_before="zero")
+    assert not begins_in_operation(Lift(), recording(2.0))  # it falls with either
+    assert begins_in_operation(Lift(), hovering[[0]], segment_length=None)
     pushed = recording(3.0, weight=0.0)
     assert not begins_in_operation(Slide(), pushed)
     assert begins_in_operation(Slide(), pushed, commands_before="first")
@@ -126,9 +131,57 @@ def test_the_likelier_commands_before_a_recording_are_taken(before):
     said = []
     original = OriginalModel(model, rollouts, DataOptions(), report=said.append)
     assert original.base.inputs.began_in_operation
-    found = original.with_other_commands_before(fit_segment_model(original.base))
+    found = original.with_likelier_commands_before(fit_segment_model(original.base))
     lag = float(found.parameters["thrust.actuator_lag.time_constant"])
     assert lag == pytest.approx(0.03, abs=3e-3)
     assert original.found_options.commands_before == ("first" if before else "zero")
-    assert said == ([] if before else ["there were no commands before the recording"])
-    assert original.with_other_commands_before(found) is found
+    sentence = "there were no commands before the recording, so delays and lags begin from zero"
+    assert said == ([] if before else [sentence])
+    assert original.with_likelier_commands_before(found) is found
+
+
+def lagging(low, high):
+    """Returns the model with a lag, and other bounds of its mass."""
+
+    def model(inputs):
+        mass = pyro.sample("mass", dist.Uniform(low, high))
+        return npdr.simulate("trajectory", Lift(), {"mass": mass}, inputs)
+
+    return add_effect(model, ActuatorLag("thrust"))
+
+
+@pytest.mark.parametrize("low", [0.5, 1.02, 1.05])
+def test_a_fit_takes_the_likelier_commands_also_where_a_prior_is_too_narrow(low):
+    prepared = prepare(lagging(low, 1.5), recording(GRAVITY), DataOptions())
+    assert prepared.options.commands_before == "zero"
+    assert not prepared.likelihood.segments.inputs.began_in_operation
+    assert not prepared.widest.segments.inputs.began_in_operation
+    assert prepared.alarm.p_value > 0.01
+    lag = float(prepared.widest.parameters["thrust.actuator_lag.time_constant"])
+    assert lag == pytest.approx(0.03, abs=3e-3)
+
+
+def test_a_search_begins_with_the_likelier_commands_where_the_model_has_the_lag():
+    original = OriginalModel(lagging(0.5, 1.5), recording(GRAVITY), DataOptions())
+    start = original.settled(original.fit_base(may_be_rough=True))
+    assert not start.segments.inputs.began_in_operation
+
+
+class Hidden(Simulator):
+    """It has a state that is not measured, and begins from what is."""
+
+    states = (*Lift.states, npdr.Channel("current", "A"))
+    sensors, actions, parameters = Lift.sensors, Lift.actions, Lift.parameters
+
+    def simulate(self, parameters, inputs):
+        made = torch.zeros(*inputs.actions.shape[:-1], 2, dtype=torch.float64)
+        return parameters["mass"][..., None, None, None] * made
+
+
+def test_a_simulator_whose_state_is_not_recorded_began_with_its_commands():
+    assert not begins_in_operation(Hidden(), recording(GRAVITY, before=GRAVITY))
+
+
+def test_other_words_than_the_known_ones_are_refused():
+    with pytest.raises(DataError, match="'zero' or 'first', which were .*; got 'frist'"):
+        DataOptions(commands_before="frist")

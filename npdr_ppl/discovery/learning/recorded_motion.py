@@ -265,8 +265,8 @@ def _command(segments: SegmentModel, port: Port) -> _Seen | None:
     column = inputs.action_names.index(port.name)
     values = {"u": inputs.actions[..., column].double(), "t": _time(segments)}
     past = inputs.past_actions[..., column].double()
-    if port.kind == "servo":
-        # A servo holds the first goal before a rollout begins.
+    if port.kind == "servo" or inputs.began_in_operation:
+        # The first command was held before the rollout began.
         num = past.shape[1]
         first = (num - inputs.start).clamp_min(0)[:, None]
         every = torch.cat((past, values["u"]), dim=1)

@@ -22,6 +22,7 @@ from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effect_context import EquivalenceClass, Excitation
 from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_fit import SegmentFit
 from npdr_ppl.preparation.segment_model import SegmentModel
@@ -40,15 +41,18 @@ class NextExperiment:
             measurements, by excitation; NaN if the simulation failed.
         amplitude: Greatest command, by action.
         separated_by: How to distinguish the alternatives, in words, if they are a known class.
+        least: Least command, by action.
         differing: Parameters of the original model whose fitted values differ between the
-            alternatives, with these values, by name. To measure one tells the alternatives apart.
+            alternatives, with the value under each alternative, by the names of the effects that
+            only it has. To measure such a parameter tells the alternatives apart.
     """
 
     excitation: Excitation | None
     separations: dict[str, float]
     amplitude: dict[str, float]
     separated_by: str
-    differing: dict[str, list[float]] = field(default_factory=dict)
+    least: dict[str, float] = field(default_factory=dict)
+    differing: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
         """Returns JSON-serialisable values."""
@@ -58,6 +62,7 @@ class NextExperiment:
             "separations": finite,
             "amplitude": self.amplitude,
             "separated_by": self.separated_by,
+            "least": self.least,
             "differing": self.differing,
         }
 
@@ -105,18 +110,19 @@ def next_experiment(
         options: How it is cut into segments.
         classes: Equivalence classes of the alternatives' effects.
     """
-    middle, largest = _ranges(rollouts)
+    low, high = _ranges(alternatives[0].simulator, rollouts)
+    middle, half = 0.5 * (low + high), 0.5 * EXPERIMENT.safe_share * (high - low)
     shapes = excitation_commands(rollouts.time_step)
-    waves = np.stack(list(shapes.values()))[..., None]
-    commands = middle + EXPERIMENT.safe_share * (largest - middle) * waves
+    commands = middle + half * np.stack(list(shapes.values()))[..., None]
     made = [_made(alternative, rollouts, commands) for alternative in alternatives]
     works = np.all([np.isfinite(readings).all((1, 2)) for readings in made], axis=0)
     smallest = np.where(works, math.inf, math.nan)
     for a, readings in zip(alternatives, made, strict=True) if works.any() else ():
         recorded = _recorded(a, rollouts, readings[works], commands[works])
+        simulated = _along(a, a, recorded, options)
         for b in alternatives:
             if a is not b:
-                found = _separations(a, b, recorded, options)
+                found = _separations(simulated, _along(b, a, recorded, options))
                 smallest[works] = np.minimum(smallest[works], found)
     separations = dict(zip(shapes, smallest.tolist(), strict=True))
     finite = {name: s for name, s in separations.items() if math.isfinite(s)}
@@ -126,25 +132,31 @@ def next_experiment(
     return NextExperiment(
         best,  # pyright: ignore[reportArgumentType]
         separations,
-        dict(zip(rollouts.action_names, (EXPERIMENT.safe_share * largest).tolist(), strict=True)),
+        dict(zip(rollouts.action_names, (middle + half).tolist(), strict=True)),
         "; ".join(dict.fromkeys(group.separated_by for group in classes)),
+        dict(zip(rollouts.action_names, (middle - half).tolist(), strict=True)),
         _differing(alternatives),
     )
 
 
-def _ranges(rollouts: Rollouts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns middle and greatest value of each command, ``(A,)``.
+def _ranges(
+    simulator: Simulator, rollouts: Rollouts
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the least and the greatest command of an excitation, ``(A,)``.
 
-    The middle is zero, unless all commands of the recording have the same sign, such as thrusts.
+    They are as far from zero as the recording's commands, to both sides. A device that only takes
+    commands of one sign, such as a rotor, gets those between the recording's least and greatest.
     """
-    actions = np.concatenate(rollouts.actions)
-    low, high = actions.min(0), actions.max(0)
-    has_both = low * high <= 0.0
-    largest = np.where(has_both, np.maximum(high, -low), high)
-    return np.where(has_both, 0.0, 0.5 * (low + high)), largest
+    every = np.concatenate(rollouts.actions)
+    limits = {action.name: (action.lower, action.upper) for action in simulator.actions}
+    low, high = every.min(0), every.max(0)
+    farthest = np.maximum(high, -low)
+    lower, upper = np.array([limits[name] for name in rollouts.action_names]).reshape(-1, 2).T
+    is_one_sided = (lower >= 0.0) | (upper <= 0.0)
+    return np.where(is_one_sided, low, -farthest), np.where(is_one_sided, high, farthest)
 
 
-def _differing(alternatives: Sequence[Hypothesis]) -> dict[str, list[float]]:
+def _differing(alternatives: Sequence[Hypothesis]) -> dict[str, dict[str, float]]:
     """Returns the values of the model's own parameters on which the alternatives disagree."""
     if not all(hypothesis.can_be_linearised for hypothesis in alternatives):
         return {}
@@ -154,7 +166,9 @@ def _differing(alternatives: Sequence[Hypothesis]) -> dict[str, list[float]]:
         information = hypothesis.share * hypothesis.linearisation.information()
         eye = torch.eye(len(information), dtype=torch.float64)
         spreads.append(torch.linalg.inv(information + eye).diagonal().sqrt())
-    found: dict[str, list[float]] = {}
+    common = set.intersection(*(set(h.names) for h in alternatives))
+    causes = [" and ".join(n for n in h.names if n not in common) for h in alternatives]
+    found: dict[str, dict[str, float]] = {}
     for site in alternatives[0].segments.prior.sites:
         if site.name in own or site.shape.numel() != 1:
             continue
@@ -165,7 +179,8 @@ def _differing(alternatives: Sequence[Hypothesis]) -> dict[str, list[float]]:
         z = torch.stack([h.fit.z[p] for h, p in zip(alternatives, places, strict=True)])
         spread = torch.stack([s[p] for s, p in zip(spreads, places, strict=True)]).max()
         if float(z.max() - z.min()) > EXPERIMENT.useful_separation * float(spread):
-            found[site.name] = [float(h.parameters[site.name]) for h in alternatives]
+            values = [float(h.parameters[site.name]) for h in alternatives]
+            found[site.name] = dict(zip(causes, values, strict=True))
     return found
 
 
@@ -243,26 +258,40 @@ def _recorded(
     )
 
 
-def _separations(
-    made: Hypothesis, refitted: Hypothesis, recorded: Rollouts, options: DataOptions
-) -> NDArray[np.float64]:
+def _along(
+    hypothesis: Hypothesis, made: Hypothesis, recorded: Rollouts, options: DataOptions
+) -> Hypothesis:
+    """Returns a hypothesis along what another one simulated, with initial states estimated there.
+
+    Args:
+        hypothesis: The hypothesis.
+        made: The one that simulated the recording, whose scale of the residuals counts.
+        recorded: The recording.
+        options: How it is cut into segments.
+    """
+    segments = SegmentModel(hypothesis.model, recorded, options)
+    fit = SegmentFit(hypothesis.fit.z, segments.no_offsets, made.fit.scale)
+    return Hypothesis(hypothesis.model, hypothesis.effects, segments, fit)
+
+
+def _separations(made: Hypothesis, refitted: Hypothesis) -> NDArray[np.float64]:
     """Returns the distance of each rollout of one hypothesis from the other, refitted to it.
 
     Both are simulated from the same estimated initial states, so that their errors do not count.
     The distance is NaN if one cannot be simulated there, and for rollouts of which no segment is
     used.
+
+    Args:
+        made: The hypothesis that simulated a recording, along it.
+        refitted: The other one, along the same recording.
     """
-    num, along = len(recorded.readings), []
-    for hypothesis in (made, refitted):
-        segments = SegmentModel(hypothesis.model, recorded, options)
-        fit = SegmentFit(hypothesis.fit.z, segments.no_offsets, made.fit.scale)
-        along.append(Hypothesis(hypothesis.model, hypothesis.effects, segments, fit))
+    segments = refitted.segments
+    num = len(segments.rollouts.readings)
     try:
-        projection = Projection(along[1])
-        difference = along[1].difference - along[0].difference
+        projection = Projection(refitted)
+        difference = refitted.difference - made.difference
     except NpdrError:
         return np.full(num, math.nan)
-    segments = along[1].segments
     change = segments.whitened(difference, made.fit.scale)[..., None]
 
     def by_rollout(values: Tensor) -> Tensor:

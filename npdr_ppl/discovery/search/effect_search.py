@@ -178,7 +178,7 @@ class Searcher(OriginalModel):
             if finer is not model:
                 is_much = log_evidence(model, finer) > TRIALS.certain_evidence
                 return "much" if is_much else "little"
-            if self.with_other_commands_before(model, compared=current) is not model:
+            if self.with_likelier_commands_before(model, compared=current) is not model:
                 return "much"
         possible = (
             self.trials.with_own_starts(other)

@@ -114,7 +114,8 @@ class OriginalModel:
         # Where a prior is too narrow, a precise fit takes many steps towards its end.
         finer = self.with_finer_steps(given, is_rough=True)
         wider = self.with_wider_priors(finer)
-        return self.converged(finer) if wider is finer else wider
+        found = self.converged(finer) if wider is finer else wider
+        return self.with_likelier_commands_before(found)
 
     def converged(self, current: Hypothesis) -> Hypothesis:
         """Returns the last fit of the original model, after precise steps if it is rough."""
@@ -165,13 +166,14 @@ class OriginalModel:
         began = self.base.inputs.began_in_operation
         return replace(self.data_options, commands_before="first" if began else "zero")
 
-    def with_other_commands_before(
+    def with_likelier_commands_before(
         self, current: Hypothesis, *, compared: Hypothesis | None = None
     ) -> Hypothesis:
         """Returns a hypothesis with other commands before the recording, if they are likelier.
 
-        Only delays and lags depend on them. If nothing is likelier, the hypothesis is unchanged.
-        All later hypotheses use the commands of the returned one.
+        Only delays and lags depend on them. If others are not likelier, the hypothesis is
+        unchanged. All later hypotheses use the commands of the returned one. They are changed once
+        at most.
 
         Args:
             current: A fitted hypothesis.
@@ -192,12 +194,27 @@ class OriginalModel:
         if found is None or not is_clearly_likelier(found, compared or current):
             return current
         self._report(
-            "the first commands had been acting before the recording"
+            "the first commands had been acting before the recording, so delays and lags begin "
+            "with them"
             if base.inputs.began_in_operation
-            else "there were no commands before the recording"
+            else "there were no commands before the recording, so delays and lags begin from zero"
         )
         self.base = base
         return found
+
+    def under_commands_found(self, given: Hypothesis) -> Hypothesis:
+        """Returns a hypothesis refitted with the commands before the recording that were found.
+
+        Args:
+            given: A hypothesis with these or the other commands before it.
+        """
+        if given.segments.inputs.began_in_operation == self.base.inputs.began_in_operation:
+            return given
+        segments = given.segments.with_other_commands_before()
+        if segments is None:
+            return given
+        found = Trials(segments).refitted_along(segments, given, given.effects)
+        return given if found is None else found
 
     def take_own_priors(
         self, current: Hypothesis, alternatives: Iterable[Hypothesis] = ()

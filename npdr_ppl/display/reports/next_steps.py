@@ -98,7 +98,7 @@ def _experiment(experiment: Any) -> list[Part]:
         hint = f" What separates them in general: {by}." if by else ""
         parts.append(TextPart(f"Next experiment, excitation: {words}.{hint}"))
     if differing := values_that_differ(experiment):
-        parts.append(TextPart(f"The causes also differ in {differing}: measure it, if you can."))
+        parts.append(TextPart(f"To measure {differing} tells the causes apart, too."))
     separations = experiment.get("separations")
     if isinstance(separations, Mapping):
         bars = {
@@ -112,11 +112,13 @@ def _experiment(experiment: Any) -> list[Part]:
             "them apart."
         )
         parts.append(DrawingPart(named_bars(bars, spec=".3g"), caption))
-    skipped = ("excitation", "separated_by", "separations", "amplitude", "differing")
+    skipped = ("excitation", "separated_by", "separations", "amplitude", "least", "differing")
     rows = [[str(n), _words(v)] for n, v in experiment.items() if n not in skipped]
     amplitude = experiment.get("amplitude")
     if isinstance(amplitude, Mapping):
-        rows += [[f"amplitude of {n}".replace("_", " "), number(v)] for n, v in amplitude.items()]
+        rows += [[f"greatest {n}".replace("_", " "), number(v)] for n, v in amplitude.items()]
+        least = experiment.get("least") or {}
+        rows += [[f"least {n}".replace("_", " "), number(v)] for n, v in least.items()]
     elif amplitude is not None:
         rows.append(["amplitude", _words(amplitude)])
     if rows:

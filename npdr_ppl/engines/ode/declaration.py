@@ -46,46 +46,67 @@ def check_declaration(system: ClosedLoopSimulator, joints: Sequence[str]) -> Non
         )
 
 
+class _Known(dict[str, Any]):
+    """Constants that say so if one is asked for that does not exist."""
+
+    def __missing__(self, key: str) -> Any:
+        raise _UnknownError(key)
+
+
+class _UnknownError(Exception):
+    """A constant does not exist."""
+
+
 def check_accelerations(
     system: ClosedLoopSimulator,
     joints: Sequence[str],
     accelerations: Callable[..., tuple[Tensor, ...]],
     constants: Any,
+    like: Tensor,
 ) -> None:
     """Evaluates the accelerations once, at rest and with nominal parameters.
+
+    Nothing is said of accelerations that cannot be computed there for another reason than those
+    below.
 
     Args:
         system: The system.
         joints: Names of its force ports, one for each coordinate.
         accelerations: Returns the acceleration of each joint.
         constants: Its last argument, for nominal parameters.
+        like: A tensor of the type and on the device of the simulation.
 
     Raises:
-        ModelError: They ask for a constant that does not exist, or ignore a force.
+        ModelError: They ask for a constant that does not exist, are not one for each joint, or
+            ignore a force.
     """
-    rest = tuple(torch.zeros(1, dtype=torch.float64) for _ in joints)
-    actions = tuple(torch.zeros(1, dtype=torch.float64) for _ in system.actions)
-    units = torch.eye(len(rest), dtype=torch.float64)
-    try:
-        free, *pushed = (
-            torch.stack(
-                [
-                    torch.as_tensor(each, dtype=torch.float64).reshape(-1)[:1]
-                    for each in accelerations(
-                        rest, rest, actions, tuple(force[None] for force in forces), constants
-                    )
-                ]
+    zero = like.new_zeros(1)
+    rest, actions = (zero,) * len(joints), (zero,) * len(system.actions)
+    known = _Known(constants) if isinstance(constants, dict) else constants
+    free = None
+    for number, joint in enumerate(("", *joints)):
+        forces = tuple(zero + float(other == joint) for other in joints)
+        try:
+            found = [
+                torch.as_tensor(each).reshape(-1)[:1].to(zero)
+                for each in accelerations(rest, rest, actions, forces, known)
+            ]
+        except _UnknownError as error:
+            raise ModelError(
+                f"{system.name}.accelerations() asks for the constant {str(error)!r}; it has "
+                f"{', '.join(constants)}."
+            ) from error
+        except Exception:  # the simulation itself shows it
+            return
+        if len(found) != len(joints):
+            raise ModelError(
+                f"{system.name}.accelerations() returns {len(found)} accelerations for "
+                f"{len(joints)} joints."
             )
-            for forces in (torch.zeros(len(rest), dtype=torch.float64), *units)
-        )
-    except KeyError as error:
-        known = f"; it has {', '.join(constants)}" if isinstance(constants, dict) else ""
-        raise ModelError(
-            f"{system.name}.accelerations() asks for the constant {error}{known}."
-        ) from error
-    for number, (joint, reached) in enumerate(zip(joints, pushed, strict=True)):
-        if bool((reached == free).all()):
+        if free is None:
+            free = torch.cat(found)
+        elif bool((torch.cat(found) == free).all()):
             raise ModelError(
                 f"{system.name}.accelerations() ignores the force at {joint}; add "
-                f"forces[{number}] to the joint's own forces, because effects act through it."
+                f"forces[{number - 1}] to the joint's own forces, because effects act through it."
             )

@@ -83,9 +83,11 @@ class ODESimulator(MechanicalSystem):
             ModelError: The accelerations ask for an unknown constant, or ignore a force.
         """
         if not self._is_checked:
-            values = self.nominal()
+            values = {name: value.to(inputs.actions) for name, value in self.nominal().items()}
             constants = self.constants(values, self.environment(values))
-            check_accelerations(self, self.joints, self.accelerations, constants)
+            check_accelerations(
+                self, self.joints, self.accelerations, constants, inputs.actions.detach()
+            )
             self._is_checked = True
         return replay(self, parameters, inputs)
 
