@@ -135,6 +135,9 @@ def cut(
                 _after_steps(rollouts, layout, num_steps, "lateness"), dtype=dtype
             ),
         }
+    initial: dict[str, Any] = {
+        name: torch.tensor(value, dtype=dtype) for name, value in starts.items()
+    }
     return Inputs(
         actions=torch.tensor(actions, dtype=dtype),
         action_names=rollouts.action_names,
@@ -147,7 +150,7 @@ def cut(
         start=torch.tensor([start for _, start, _ in layout]),
         **_whole_rollouts(rollouts, dtype),
         **sampling,
-        **{name: torch.tensor(value, dtype=dtype) for name, value in starts.items()},
+        **initial,
     )
 
 
