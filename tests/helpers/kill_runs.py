@@ -127,10 +127,11 @@ def main():
         folder = root / f"run_{runs}"
         runs += 1
         is_done = False
-        # Short lives, so that a run is killed several times on its way; longer ones after each
+        # Lives are shorter than a run, so that it is killed on its way, and longer than its start,
+        # in which nothing is written and which can take a third of it. They get longer after each
         # kill, so that it comes to its end also where the machine has become slower since.
         # Discovery begins anew after a kill, so it needs lives that are longer than it is.
-        longest = (1.0 if mode == "discover" else 0.4) * seconds
+        longest = (1.0 if mode == "discover" else 0.8) * seconds
         while not is_done:
             child = fork(folder, seed, mode)
             time.sleep(moments.uniform(0.0, longest))
