@@ -171,6 +171,26 @@ class Inputs:
         """Leading dimensions; empty unless devices have different inputs."""
         return self.actions.shape[:-3]
 
+    def commands(self, column: int, *, num_past: int, is_goal: bool) -> Tensor:
+        """Returns the past and the present commands of one action, ``(..., S, num_past + K)``.
+
+        Those before a rollout are its first one if it is the goal of a servo, or if the recording
+        began in operation; otherwise they are zero.
+
+        Args:
+            column: Column of the action.
+            num_past: Number of past steps, at most H.
+            is_goal: Whether the action is the goal of a servo.
+        """
+        left_out = self.past_actions.shape[-2] - num_past
+        past = self.past_actions[..., left_out:, column]
+        every = torch.cat((past, self.actions[..., column]), dim=-1)
+        if not (is_goal or self.began_in_operation):
+            return every
+        first = (num_past - self.start).clamp_min(0)[..., None]
+        held = every.gather(-1, first.expand(*every.shape[:-1], 1))
+        return torch.where(torch.arange(every.shape[-1], device=every.device) < first, held, every)
+
     @property
     def is_start_uncertain(self) -> bool:
         """Whether every simulation draws its own initial states."""

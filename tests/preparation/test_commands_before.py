@@ -123,6 +123,32 @@ def test_an_output_behind_a_lag_is_the_first_command_of_a_recording_in_operation
         assert float(made[0, -1, 1]) == pytest.approx(speed, abs=1e-3)
 
 
+ROD = """<mujoco><option timestep="0.001"/><worldbody><body>
+<joint name="hinge" axis="0 1 0"/>
+<geom type="capsule" size="0.01" fromto="0 0 0 0.4 0 0" mass="1"/>
+</body></worldbody><actuator><motor name="motor" joint="hinge" ctrlrange="-9 9"/></actuator>
+</mujoco>"""
+
+
+def test_a_motor_behind_a_lag_holds_a_rod_in_mujoco(tmp_path):
+    (tmp_path / "rod.xml").write_text(ROD)
+    rod = npdr.MujocoSimulator(tmp_path / "rod.xml", {}).with_effects(ActuatorLag("motor"))
+    begun = npdr.Inputs.single(
+        torch.full((40, 1), -0.2 * GRAVITY, dtype=torch.float64),
+        torch.zeros(len(rod.states), dtype=torch.float64),
+        action_names=("motor",),
+        state_names=tuple(state.name for state in rod.states),
+        time_step=STEP,
+    )
+    lag = {"motor.actuator_lag.time_constant": torch.tensor(0.05)}
+    fallen, held = (
+        float(rod.simulate(lag, replace(begun, began_in_operation=began))[0, -1].abs().max())
+        for began in (False, True)
+    )
+    assert fallen > 0.1
+    assert held < 1e-6
+
+
 @pytest.mark.parametrize("before", [0.0, GRAVITY])
 def test_the_likelier_commands_before_a_recording_are_taken(before):
     # Held by hand until its rotors begin, it rests as if the first thrust kept it in the air.

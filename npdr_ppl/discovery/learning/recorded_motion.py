@@ -263,15 +263,10 @@ def _command(segments: SegmentModel, port: Port) -> _Seen | None:
     if port.name not in inputs.action_names:
         return None
     column = inputs.action_names.index(port.name)
-    values = {"u": inputs.actions[..., column].double(), "t": _time(segments)}
-    past = inputs.past_actions[..., column].double()
-    if port.kind == "servo" or inputs.began_in_operation:
-        # The first command was held before the rollout began.
-        num = past.shape[1]
-        first = (num - inputs.start).clamp_min(0)[:, None]
-        every = torch.cat((past, values["u"]), dim=1)
-        past = torch.where(torch.arange(num) < first, every.gather(1, first), past)
-    return values, {"u": port.unit, "t": "s"}, past, inputs.time_step, ()
+    num_past = inputs.past_actions.shape[-2]
+    every = inputs.commands(column, num_past=num_past, is_goal=port.kind == "servo").double()
+    values = {"u": every[:, num_past:], "t": _time(segments)}
+    return values, {"u": port.unit, "t": "s"}, every[:, :num_past], inputs.time_step, ()
 
 
 def _reading(hypothesis: Hypothesis, segments: SegmentModel, port: Port) -> _Seen | None:

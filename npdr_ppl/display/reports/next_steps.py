@@ -98,7 +98,7 @@ def _experiment(experiment: Any) -> list[Part]:
         hint = f" What separates them in general: {by}." if by else ""
         parts.append(TextPart(f"Next experiment, excitation: {words}.{hint}"))
     if differing := values_that_differ(experiment):
-        parts.append(TextPart(f"To measure {differing} tells the causes apart, too."))
+        parts.append(TextPart(f"Measuring {differing} also tells the causes apart."))
     separations = experiment.get("separations")
     if isinstance(separations, Mapping):
         bars = {

@@ -53,17 +53,11 @@ class CommandRecord:
         num_past: int,
         is_goal: bool = False,
     ) -> None:
-        left_out = inputs.past_actions.shape[-2] - num_past
-        past = inputs.past_actions[..., left_out:, column]
-        known = torch.cat((past, inputs.actions[..., column]), dim=-1)
+        known = inputs.commands(column, num_past=num_past, is_goal=is_goal)
         known = known.to(dtype).clamp(*limits)
-        before = torch.where(inputs.start == 0, torch.zeros_like(known[..., 0]), known[..., 0])
-        if is_goal or inputs.began_in_operation:
-            first = (num_past - inputs.start).clamp_min(0)[..., None]
-            goal = known.gather(-1, first.expand(*known.shape[:-1], 1))
-            is_before = torch.arange(known.shape[-1], device=known.device) < first
-            known = torch.where(is_before, goal, known)
-            before = known[..., 0]
+        before = known[..., 0]
+        if not (is_goal or inputs.began_in_operation):
+            before = torch.where(inputs.start == 0, torch.zeros_like(before), before)
         # Time is the first axis, so that the commands of one step are contiguous in memory.
         self._table = torch.cat((before[..., None], known), dim=-1).movedim(-1, 0).contiguous()
         self.table, self.stride = self._table.reshape(-1), self._table[0].numel()
