@@ -48,7 +48,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
     from npdr_ppl.discovery.proof.estimated_anew import ANEW
 
     if found["effects"]:
-        table = Table(title="Missing effects", box=SIMPLE, padding=(0, 1, 0, 0))
+        table = Table(title="Effects in the revised model", box=SIMPLE, padding=(0, 1, 0, 0))
         width = min(WIDEST_NAME, max(len(f"at {row['port']}") for row in found["effects"]))
         table.add_column("effect", overflow="fold", min_width=width)
         table.add_column("parameter", overflow="fold")

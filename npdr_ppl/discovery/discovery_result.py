@@ -125,10 +125,18 @@ class Discovery:
             return self.learned.model.hypothesis
         return self.search.final
 
+    @property
+    def named(self) -> list[str]:
+        """Names of the effects that the verdict ``named`` names, empty with another verdict."""
+        if self.verdict != "named":
+            return []
+        return [f.effect.name for f in self.effects if f.is_sure(self.settings.confidence)]
+
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the content of ``discovery.json``."""
         return {
             "verdict": self.verdict,
+            "named": self.named,
             "reason": self.reason,
             "has_stopped": self.search.has_stopped,
             "preparation": self.preparation.to_dict(),

@@ -62,6 +62,14 @@ class Finding:
         """Whether it is missing, large enough, and found again in parts of the recording."""
         return not self.is_minor and not self.corrects and not self.doubt
 
+    def is_sure(self, confidence: float) -> bool:
+        """Returns whether it can be named and is likely enough.
+
+        Args:
+            confidence: Probability above which one cause is named.
+        """
+        return self.can_be_named and self.probability >= confidence
+
     @property
     def doubt(self) -> str:
         """Why it is not found again in parts of the recording; see :func:`doubt_of`."""

@@ -36,7 +36,7 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
     word = str(result.get("verdict", "no verdict"))
     effects = result.get("effects") or []
     large = [e for e in effects if not why_unnamed(e) and not told_doubt(e)] or effects
-    names = _named(str(result.get("reason") or ""))
+    names = result.get("named") or ()
     named = [e for e in large if f"{e.get('port')}.{e.get('effect')}" in names]
     labels = [effect_label(effect) for effect in named or large]
     p_value = number((result.get("alarm") or {}).get("p_value"))
@@ -63,11 +63,6 @@ def headline(result: Mapping[str, Any]) -> tuple[str, str]:
         "learned": (f"Learned: {_laws(result) or 'a law'}", gained),
     }
     return verdicts.get(word, (word, reason))
-
-
-def _named(reason: str) -> list[str]:
-    """Returns the names of the effects that the reason of a verdict ``named`` lists."""
-    return reason.partition("Missing: ")[2].partition(". ")[0].rstrip(".").split(", ")
 
 
 def _laws(result: Mapping[str, Any]) -> str:

@@ -66,8 +66,8 @@ def judge(
     doubtful = [f for f in effects if f.doubt]
     if sum(f.share for f in doubtful) > VERDICT.minor_share * explains:
         return "unknown", f"{doubtful[0].effect.name} {doubtful[0].doubt}."
-    unsure = [f for f in effects if f.probability < options.confidence and f.can_be_named]
-    sure = [f for f in effects if f.probability >= options.confidence and f.can_be_named]
+    sure = [f for f in effects if f.is_sure(options.confidence)]
+    unsure = [f for f in effects if f.can_be_named and f not in sure]
     if sure and sum(f.share for f in unsure) <= VERDICT.minor_share * explains:
         if gap and gap["rmse"].is_open:
             return "unknown", _still_open(sure, gap["rmse"])
@@ -86,7 +86,7 @@ def judge(
 def most_doubtful(effects: Sequence[Finding], options: DiscoveryOptions) -> Finding:
     """Returns the uncertain effect, of those that can be named, that explains most."""
     return max(
-        (f for f in effects if f.probability < options.confidence and f.can_be_named),
+        (f for f in effects if f.can_be_named and not f.is_sure(options.confidence)),
         key=lambda found: found.share,
     )
 

@@ -29,8 +29,8 @@ def test_corrections_and_small_effects_are_not_in_the_headline():
 
 
 def test_only_effects_that_the_verdict_names_are_in_the_headline():
-    reason = "Missing: hinge.bias, hinge.cogging. The revised model takes finer steps."
-    result = found("bias", "spring", "cogging", "backlash", reason=reason)
+    named = ["hinge.bias", "hinge.cogging"]
+    result = found("bias", "spring", "cogging", "backlash", named=named)
     assert headline(result)[0] == "Missing: constant force at hinge, and cogging at hinge"
 
 

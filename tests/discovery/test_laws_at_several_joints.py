@@ -92,11 +92,16 @@ def test_joints_without_the_law_are_no_members(searched):
 
 
 @pytest.mark.slow
-def test_friction_in_three_joints_is_added_at_once(searched):
+@pytest.mark.parametrize(
+    ("max_effects", "num_rounds"),
+    [(1, 2), pytest.param(5, 3, id="once two of its joints were added")],
+)
+def test_friction_in_three_joints_is_added_at_once(searched, max_effects, num_rounds):
     searcher, first, said = searched
-    found = searcher.run(first, max_effects=1)
+    said.clear()
+    found = searcher.run(first, max_effects=max_effects)
     assert set(found.final.names) == {f"{name}_torque.coulomb_friction" for name in FRICTION}
-    assert len(found.rounds) == 2
+    assert len(found.rounds) == num_rounds
     assert any(text.endswith("together are likelier") for text in said)
     for name, magnitude in FRICTION.items():
         value = found.final.parameters[f"{name}_torque.coulomb_friction.magnitude"]

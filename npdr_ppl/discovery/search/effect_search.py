@@ -138,7 +138,7 @@ class Searcher(OriginalModel):
             changed = self._settle(single, rounds[-1])
             if changed:
                 return single, changed
-        likelier = self._with_law_at_several(rounds[-1], single)
+        likelier = self._with_law_at_several(rounds, single, max_effects)
         extended = self._with_likelier_pair(rounds, likelier, max_effects)
         is_new = extended is not single
         if extended is current or (is_new and is_negligible(first, current, extended)):
@@ -336,18 +336,30 @@ class Searcher(OriginalModel):
         self._report(f"adding {best}")
         return best, weights, trials
 
-    def _with_law_at_several(self, now: Round, current: Hypothesis) -> Hypothesis:
+    def _with_law_at_several(
+        self, rounds: list[Round], current: Hypothesis, max_effects: int
+    ) -> Hypothesis:
         """Returns the model with one law at several joints, if that is likelier.
 
-        Each joint alone may explain too little to be added.
+        With its many strengths such a law explains more than any single effect, also where two
+        effects of different kinds are missing. So it is compared with the two effects that were
+        added last. It is compared with the model as it is if nothing was added in this round,
+        because each joint alone may explain too little, or if nothing more may be added.
 
         Args:
-            now: The results before the last addition.
-            current: The model after it, if there was one.
+            rounds: The results before each addition.
+            current: The model after the last round's addition, if there was one.
+            max_effects: Greatest number of effects.
         """
-        if not now.laws or self._deadline.stops():
-            return current
-        return self._likelier(now, now.laws, current, "laws at several joints", num_new=1)
+        asked = [rounds[-2]] if _is_single_addition(rounds) else []
+        is_full = num_counted(current.effects) >= max_effects
+        if current is rounds[-1].hypothesis or is_full:
+            asked.append(rounds[-1])
+        for before in asked:
+            if before.laws and not self._deadline.stops():
+                stage = "laws at several joints"
+                current = self._likelier(before, before.laws, current, stage, num_new=1)
+        return current
 
     def _with_likelier_pair(
         self, rounds: list[Round], current: Hypothesis, max_effects: int
@@ -362,12 +374,12 @@ class Searcher(OriginalModel):
             current: The model after the last round's addition, if there was one.
             max_effects: Greatest number of effects.
         """
-        if len(rounds) < 2:
+        if not _is_single_addition(rounds):
             return current
         before, after = rounds[-2], rounds[-1].hypothesis
         new = set(after.names) - set(before.hypothesis.names)
         pairs = [pair for pair in before.pairs if not pair.names & new]
-        if len(new) != 1 or num_counted(before.hypothesis.effects) + 2 > max_effects:
+        if num_counted(before.hypothesis.effects) + 2 > max_effects:
             return current
         if not pairs or self._deadline.stops():
             return current
@@ -423,6 +435,13 @@ class Searcher(OriginalModel):
                 self._report(f"removing {effect.name}")
                 current = without
         return current
+
+
+def _is_single_addition(rounds: list[Round]) -> bool:
+    """Returns whether the last round's model has one effect that the one before has not."""
+    if len(rounds) < 2:
+        return False
+    return len(set(rounds[-1].hypothesis.names) - set(rounds[-2].hypothesis.names)) == 1
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:
