@@ -182,10 +182,29 @@ def test_what_was_hopeless_in_coarse_steps_is_not_fitted_again(dragged, looks):
     # Without another look, those that did not come to a full fit are hopeless, too.
     weights = {"": 0.0, "hinge.bias": 1e-200, "hinge.cogging": 0.3} if looks else {"": 0.0}
     coarse = replace(looked, weights=weights, hopeless=frozenset({"hinge.spring"}))
-    again = searcher._begun_again(coarse, looks=looks)
+    (again,) = searcher._begun_again([coarse], looks=looks)
     # A new look begins anew; without one, what was not fitted before stays hopeless.
     assert again.hopeless == {"", "hinge.bias"} | (set() if looks else {"hinge.spring"})
     assert again.hypothesis is not looked.hypothesis
     assert not again.weights
     # With all candidates hopeless, there is nothing to fit.
     assert searcher._extended(again.hypothesis, again) == (None, {}, {})
+
+
+def test_after_a_small_change_the_effects_that_were_added_are_kept(dragged):
+    case, base = dragged
+    laws = QuadraticDrag("hinge"), Bias("hinge")
+    searcher = Searcher(case.model, case.fit, npdr.DiscoveryOptions(effects=laws))
+    first = searcher.look(base)
+    added = searcher.look(searcher.trials.refitted(base, laws[:1]))
+    rounds = [first, replace(added, weights={"": 0.5, "hinge.bias": 0.5})]
+    (begun,) = searcher._begun_again(rounds, looks=True)
+    again = searcher._begun_again(rounds, looks=False)
+    assert begun.hypothesis.names == ()
+    assert [round.hypothesis.names for round in again] == [(), ("hinge.quadratic_drag",)]
+    assert again[1].ranking is added.ranking
+    assert not again[1].hopeless & {"hinge.bias"}
+    # The model is the same, and so is what fits best.
+    was, now = (r.hypothesis.parameters for r in (added, again[1]))
+    for name, value in was.items():
+        assert float(now[name]) == pytest.approx(float(value), rel=0.02)

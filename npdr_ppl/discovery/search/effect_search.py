@@ -102,8 +102,9 @@ class Searcher(OriginalModel):
             if changed:
                 # The missing effect had hidden that the steps are too coarse, or that the model's
                 # own priors suffice.
-                first = now = self._begun_again(rounds[0], looks=changed == "much")
-                current, rounds = first.hypothesis, [first]
+                rounds = self._begun_again(rounds, looks=changed == "much")
+                first, now = rounds[0], rounds[-1]
+                current = now.hypothesis
                 continue
             if extended is current:
                 break
@@ -187,29 +188,29 @@ class Searcher(OriginalModel):
         )
         return "little" if self.take_own_priors(current, possible) else ""
 
-    def _begun_again(self, first: Round, *, looks: bool) -> Round:
-        """Returns the first round with the original model in the present steps and priors.
+    def _begun_again(self, rounds: list[Round], *, looks: bool) -> list[Round]:
+        """Returns rounds in the present steps and priors, the last of which is to be done again.
 
         Candidates whose fit was hopeless before are not fitted again.
 
         Args:
-            first: The round in coarser steps, or with wider priors.
-            looks: Whether to screen the candidates again, because others could now explain most.
-                In narrower priors, only those can explain as much that did before.
+            rounds: The rounds in coarser steps, or with wider priors.
+            looks: Whether to begin with the first round and to screen the candidates again,
+                because others could now explain most. In narrower priors, only those can explain
+                as much that did before. The rounds then only get their model fitted again.
         """
+        first = rounds[0]
         fitted = self.fit_base(near=first.hypothesis.parameters)
-        hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
         if looks:
-            return replace(self.look(fitted), hopeless=frozenset(hopeless))
-        hopeless |= {c.name for c in first.ranking if c.name not in first.weights}
-        return replace(
-            first,
-            hypothesis=fitted,
-            averaged=fitted.averaged(),
-            weights={},
-            trials={},
-            hopeless=first.hopeless | hopeless,
-        )
+            hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
+            return [replace(self.look(fitted), hopeless=frozenset(hopeless))]
+        again = [_with_model(first, fitted)]
+        for before in rounds[1:]:
+            found = self.trials.refitted(before.hypothesis)
+            if found is None:
+                break
+            again.append(_with_model(before, self.trials.with_own_starts(found)))
+        return again
 
     def _revised(self, current: Hypothesis, rounds: list[Round], max_effects: int) -> Search:
         """Returns the effects that are found again, in their simplest form, and alternatives.
@@ -435,6 +436,25 @@ class Searcher(OriginalModel):
                 self._report(f"removing {effect.name}")
                 current = without
         return current
+
+
+def _with_model(before: Round, fitted: Hypothesis) -> Round:
+    """Returns a round whose model was fitted again, without what was tried.
+
+    Args:
+        before: The round.
+        fitted: The model.
+    """
+    hopeless = {name for name, weight in before.weights.items() if weight < SEARCH.hopeless}
+    hopeless |= {c.name for c in before.ranking if c.name not in before.weights}
+    return replace(
+        before,
+        hypothesis=fitted,
+        averaged=fitted.averaged(),
+        weights={},
+        trials={},
+        hopeless=before.hopeless | hopeless,
+    )
 
 
 def _is_single_addition(rounds: list[Round]) -> bool:
