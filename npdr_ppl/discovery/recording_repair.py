@@ -34,6 +34,7 @@ from npdr_ppl.rollouts.collection import with_commands, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
 from npdr_ppl.rollouts.notes import faults_among
 from npdr_ppl.rollouts.simulator_checks import limited_commands
+from npdr_ppl.rollouts.wrapped_angles import unwrapped
 
 __all__ = ["Repair", "repair"]
 
@@ -162,7 +163,7 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
             f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor of "
             f"the model, {names}; rename them."
         )
-    rollouts = without_faults(rollouts, measured)
+    rollouts = without_faults(unwrapped(rollouts, measured), measured)
     try:
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     except DataError as error:
