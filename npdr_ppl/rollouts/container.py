@@ -387,11 +387,20 @@ class Rollouts(Recording):
         names = self.channel_names if channels is None else tuple(channels)
         columns = segments.columns_of(names, self.channel_names)
         source = [sampling.values for sampling in self.samplings] or self.readings
-        used = [
-            np.concatenate([np.arange(first, end) for first, end in ((0, 0), *spans)])
-            for spans in self.spans
-        ]
         return [
             torch.from_numpy(values[rows][:, columns])
-            for values, rows in zip(source, used, strict=True)
+            for values, rows in zip(source, self._rows_of_series, strict=True)
+        ]
+
+    @property
+    def times_of_series(self) -> list[Array]:
+        """Time stamps of the rows of :meth:`series` in s, ``(T,)`` per rollout."""
+        return [time[rows] for time, rows in zip(self.time, self._rows_of_series, strict=True)]
+
+    @property
+    def _rows_of_series(self) -> list[NDArray[np.int64]]:
+        """The rows before each step of the usable stretches, per rollout."""
+        return [
+            np.concatenate([np.arange(first, end) for first, end in ((0, 0), *spans)])
+            for spans in self.spans
         ]

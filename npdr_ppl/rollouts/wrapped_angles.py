@@ -42,7 +42,8 @@ def unwrapped(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
     An angle is wrapped if all its values lie within a turn, if it changes by more than half a turn
     between two measurements, and if most of these changes are smooth once a turn is subtracted.
     Other changes must be below a quarter of a turn; of faster motion or of noise the turns cannot
-    be told. A channel is left as it is if its declared bounds are within a turn: the simulator wraps it, too.
+    be told. A channel is left as it is if its declared bounds are within a turn: the simulator
+    wraps it, too.
 
     Args:
         rollouts: The recording.

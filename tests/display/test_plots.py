@@ -76,6 +76,23 @@ def test_bands_have_every_channel():
     assert figure.axes[0].get_ylim()[1] < 2
 
 
+def test_nothing_is_drawn_across_a_gap():
+    time = np.delete(np.linspace(0, 1, 50), slice(20, 30))
+    measured = np.stack([np.sin(time), np.cos(time)], -1)
+    figure = plot_bands(time, measured, measured[None], channel_names=("x", "y"))
+    (line,) = (line for line in figure.axes[0].lines if line.get_label() == "measured")
+    assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [20]
+    assert np.isfinite(figure.axes[0].get_ylim()).all()
+
+
+def test_a_recording_with_a_gap_has_the_times_of_what_is_used():
+    rollouts = dataclasses.replace(recorded(), stretches=(((0, 20), (30, 60)),))
+    (series,), (time,) = rollouts.series(), rollouts.times_of_series
+    assert time.tolist() == pytest.approx([0.02 * k for k in (*range(20), *range(30, 60))])
+    found = replay(pendulum, rollouts, {"mass": torch.ones(1), "length": torch.ones(1)}, OPTIONS)
+    assert len(time) == len(series) == found.series()[0].shape[-2]
+
+
 def recorded(num_steps=60):
     """A pendulum's swing in columns without units, as a CSV file has them."""
     time = 0.02 * np.arange(num_steps + 1)

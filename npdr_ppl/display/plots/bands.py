@@ -14,7 +14,10 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.evaluation import nominal_parameters, replay
 from npdr_ppl.rollouts import Rollouts
 
-__all__ = ["nominal_line", "plot_bands"]
+__all__ = ["nominal_line", "plot_bands", "with_breaks"]
+
+GAP = 1.5
+"""Time between two rows, in usual ones, from which nothing is drawn between them."""
 
 
 def plot_bands(
@@ -30,7 +33,7 @@ def plot_bands(
     """Draws the recording, the posterior predictive's bands and single simulations.
 
     Args:
-        time: Seconds, ``(T,)``.
+        time: Seconds, ``(T,)``. Nothing is drawn across gaps.
         measured: The recording, ``(T, C)``.
         predictive: Posterior predictive draws, ``(n, T, C)``.
         channel_names: Names of the C channels.
@@ -48,12 +51,18 @@ def plot_bands(
                 band = np.quantile(predictive[..., c], [low, high], axis=0)
                 ends += [band.min(), band.max()]
                 axis.fill_between(
-                    time, band[0], band[1], color=COLORS["posterior"], alpha=alpha, lw=0,
+                    *with_breaks(time, *band), color=COLORS["posterior"], alpha=alpha, lw=0,
                     label=f"posterior {high - low:.0%}",
                 )  # fmt: skip
             for label, line in (lines or {}).items():
-                axis.plot(time, line[:, c], color=COLORS.get(label, "C1"), lw=0.9, label=label)
-            axis.plot(time, measured[:, c], color=COLORS["measured"], lw=1.1, label="measured")
+                axis.plot(
+                    *with_breaks(time, line[:, c]),
+                    color=COLORS.get(label, "C1"),
+                    lw=0.9,
+                    label=label,
+                )
+            shown = with_breaks(time, measured[:, c])
+            axis.plot(*shown, color=COLORS["measured"], lw=1.1, label="measured")
             if np.isfinite(ends).all():
                 # Recording and bands set the axis limits; lines outside them are cut.
                 margin = 0.05 * (max(ends) - min(ends)) + np.finfo(float).tiny
@@ -66,6 +75,22 @@ def plot_bands(
         axes[0].set_xlim(time[0], time[-1])
         add_legend(figure, loc="outside upper center", ncols=5)
     return figure
+
+
+def with_breaks(
+    time: NDArray[np.float64], *columns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], ...]:
+    """Returns times and columns with NaN in each gap of the time, so that no line crosses it.
+
+    Args:
+        time: Seconds, ``(T,)``.
+        columns: Values at these times, ``(T,)`` each.
+    """
+    steps = np.diff(time)
+    breaks = 1 + np.flatnonzero(steps > GAP * np.median(steps)) if len(steps) else steps
+    if not len(breaks):
+        return time, *columns
+    return tuple(np.insert(each, breaks, np.nan) for each in (time, *columns))
 
 
 def nominal_line(

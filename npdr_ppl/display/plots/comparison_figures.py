@@ -89,7 +89,7 @@ def write_comparison_figures(
     replayed = next(iter(replays.values()))
     names = replayed.channel_names
     figure = plot_bands_by_backend(
-        shown.time[0][:-1],
+        shown.times_of_series[0],
         shown.series(names)[0].numpy(),
         {label: found.series()[0].double().cpu().numpy() for label, found in replays.items()},
         channel_names=names,

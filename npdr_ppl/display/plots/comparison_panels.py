@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from npdr_ppl.display.plots.bands import with_breaks
 from npdr_ppl.display.plots.marginals import MAX_COLUMNS, Samples, add_legend, density
 from npdr_ppl.drawing.theme import COLORS, SERIES, theme
 
@@ -136,7 +137,8 @@ def plot_bands_by_backend(
                     if not len(whole):
                         continue
                     band = np.quantile(whole[..., c], [low, high], axis=0)
-                    axis.fill_between(time, band[0], band[1], color=color, alpha=alpha, lw=0)
+                    shown = with_breaks(time, *band)
+                    axis.fill_between(*shown, color=color, alpha=alpha, lw=0)
                 if len(whole):
                     # The band of a sharp posterior is too thin to see, so the median is drawn too.
                     middle = np.median(whole[..., c], axis=0)
@@ -147,7 +149,8 @@ def plot_bands_by_backend(
                     look = {"color": "0.4", "lw": 0.7, "ls": "--"}
                     for start, stop in _stretches(time, resets):
                         axis.plot(time[start:stop], line[start:stop, c], label=entry, **look)
-                axis.plot(time, measured[:, c], color=COLORS["measured"], lw=0.8, label="measured")
+                shown = with_breaks(time, measured[:, c])
+                axis.plot(*shown, color=COLORS["measured"], lw=0.8, label="measured")
                 if column == 0:
                     unit = units[c] if c < len(units) else ""
                     name = channel_names[c]

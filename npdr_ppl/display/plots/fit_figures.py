@@ -78,7 +78,7 @@ def write_fit_figures(
     single = replay(model, shown, {n: v[None] for n, v in most_likely.items()}, options)
     names = replayed.channel_names
     figure = plot_bands(
-        shown.time[0][:-1],
+        shown.times_of_series[0],
         shown.series(names)[0].numpy(),
         replayed.series()[0].double().cpu().numpy(),
         channel_names=names,

@@ -58,7 +58,7 @@ def plot_replays(models: Mapping[str, Hypothesis], rollouts: Rollouts, length: i
     found = next(iter(replays.values()))
     units = {sensor.name: sensor.unit for sensor in Furuta.sensors}
     measured = rollouts.series(found.channel_names)[0].numpy()
-    time = rollouts.time[0][:-1]
+    (time,) = rollouts.times_of_series
     with theme():
         figure = Figure(figsize=(7.5, 1.5 * len(units) + 0.4), layout="constrained")
         axes = figure.subplots(len(found.channel_names), 1, sharex=True, squeeze=False)[:, 0]
