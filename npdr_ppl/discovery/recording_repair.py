@@ -218,7 +218,6 @@ def _trusted_remedy(
         as_read: The fit of the recording as it was read; ``None`` if simulations fail.
         report: Called with a short status.
     """
-    report("checking the recording: trying other units, signs and time stamps")
     trials = RemedyTrials(model, rollouts, windows, as_read)
     present, ratio = trials.present, trials.ratio
     segments = SegmentModel(model, rollouts, options) if as_read is None else as_read.segments
@@ -227,14 +226,14 @@ def _trusted_remedy(
     suspects = {s.name for s in sensors if present.get(s.name, math.inf) >= REPAIR.large_residual}
     joints = {s.rate_of or s.name for s in sensors if s.name in suspects}
     singly = len(joints) <= REPAIR.most_suspects
-    best, least = _best(remedies(sensors, rollouts, suspects, singly=singly), ratio)
+    best, least = _best(remedies(sensors, rollouts, suspects, singly=singly), ratio, report)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
     if best is not None and least < REPAIR.remedy_factor:
         without = trials.ratio_without(best)
     else:
         # A channel is given up only if nothing else helps.
-        best, least = _best(without_one(sensors) if singly else (), ratio)
+        best, least = _best(without_one(sensors) if singly else (), ratio, report)
         without = 1.0
     if best is None or least >= REPAIR.remedy_factor * without:
         return None
@@ -245,11 +244,16 @@ def _trusted_remedy(
 
 
 def _best(
-    remedies: Iterable[Remedy], ratio: Callable[[Remedy], float]
+    remedies: Iterable[Remedy], ratio: Callable[[Remedy], float], report: Callable[[str], None]
 ) -> tuple[Remedy | None, float]:
-    """Returns the remedy with the least ratio, and the ratio."""
+    """Returns the remedy with the least ratio, and the ratio; says how many are tried."""
     best, least = None, math.inf
-    for remedy in remedies:
+    waiting = list(remedies)
+    for number, remedy in enumerate(waiting):
+        report(
+            f"checking the recording: {number} of {len(waiting)} other units, signs and time "
+            "stamps tried"
+        )
         found = ratio(remedy)
         if found < least:
             best, least = remedy, found
