@@ -59,7 +59,11 @@ class Tilt(EnvironmentEffect):
 
 
 class Payload(EnvironmentEffect):
-    """An extra mass Δm at the place of the port, with its inertia and weight."""
+    """An extra mass Δm at the place of the port, with its inertia and weight.
+
+    In MuJoCo, the place is the centre of mass of the last body. A load elsewhere, as at the tip,
+    then has another mass, and other effects make up for the rest.
+    """
 
     id = "payload"
     parameters = (Parameter("mass", "{port}", 0.0, "extra mass Δm"),)

@@ -180,7 +180,8 @@ def sample_posterior(
         result = WeightedDraws(z, w, space, smoothed, k_hat, size, iteration + 1)
         # If hardly any draw has a weight, all are set equal; see :func:`smoothed_weights`.
         size = size if math.isfinite(k_hat) else 0.0
-        report(f"{len(z)} draws, {size:.0f} of {settings.enough_effective:.0f} effective ones")
+        wanted = settings.enough_effective
+        report(f"{len(z)} draws, {min(size, wanted):.0f} of {wanted:.0f} effective ones")
         if result.k_hat <= settings.reliable_k and result.effective >= settings.enough_effective:
             break
         if iteration + 1 >= settings.iterations_to_adapt and size < z.shape[1]:

@@ -11,6 +11,7 @@ import pytest
 from npdr_ppl.display.reports import read_run, write_report
 from npdr_ppl.display.reports.content import DiffPart, FindingsPart, unfolded
 from npdr_ppl.display.reports.meanings import findings
+from npdr_ppl.display.reports.next_steps import next_section
 from npdr_ppl.display.reports.run_report import MAX_BYTES
 from npdr_ppl.errors import DataError
 from tests.helpers.arm_discovery import write_arm_discovery
@@ -185,6 +186,19 @@ def test_a_learned_law_is_the_headline_and_is_shown_where_it_was_checked(tmp_pat
 def test_a_discovery_of_little_is_shown_too(tmp_path, verdict):
     (tmp_path / "discovery.json").write_text(json.dumps({"verdict": verdict}))
     assert verdict in write_report(tmp_path).read_text() or verdict != "unknown"
+
+
+def test_where_no_excitation_helps_the_report_does_not_ask_for_another_recording():
+    differing = {"gain": {"left": 1.59, "right": 1.4}}
+    nothing = {"excitation": None, "separated_by": "", "separations": {}, "differing": differing}
+    measure = next_section({"verdict": "ambiguous", "next_experiment": nothing})
+    (found,) = measure.parts[0].findings
+    assert found.value == "measure a parameter in which they differ"
+    assert "npdr plan" not in found.meaning
+    assert any("Measuring gain (1.59 with left" in str(part) for part in measure.parts)
+    for experiment in (None, {**nothing, "excitation": "chirp", "amplitude": {}}):
+        record = next_section({"verdict": "ambiguous", "next_experiment": experiment})
+        assert record.parts[0].findings[0].value == "record again"
 
 
 def test_changed_curves_are_refused_with_a_sentence(tmp_path):

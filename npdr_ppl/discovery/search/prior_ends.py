@@ -55,8 +55,9 @@ class PriorEnd:
 
     def __str__(self) -> str:
         return (
-            f"{self.name} is at the {self.end} end of its prior, {self.prior}; the fit with a "
-            f"wider prior gives about {self.closest:.4g}: widen the prior"
+            f"{self.name} fits better {'below' if self.end == 'lower' else 'above'} its prior, "
+            f"{self.prior}; the fit with wider priors gives about {self.closest:.4g}: widen the "
+            "prior"
         )
 
 

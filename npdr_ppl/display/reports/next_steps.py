@@ -37,8 +37,7 @@ STEPS: Mapping[str, tuple[str, Tone, str]] = {
         "record again",
         "warn",
         "The revised model has the likeliest cause. It predicts well under a similar excitation, "
-        "but possibly not under another. Record what npdr plan designs, and search both "
-        "recordings together.",
+        "but possibly not under another.",
     ),
     "unknown": (
         "do not rely on the revised model",
@@ -75,6 +74,9 @@ def next_section(result: Mapping[str, Any], *, said: str = "") -> Section:
     if result.get("has_stopped"):
         step = "continue the search"
         why = "A time limit ended it. The same command with a longer limit continues it."
+    elif verdict == "ambiguous":
+        step, told = _to_tell_apart(result.get("next_experiment"))
+        why = f"{why} {told}"
     findings = [Explained("Next", step, tone, why)]
     reason = in_words(str(result.get("reason") or ""))
     if reason and reason != said:
@@ -85,6 +87,15 @@ def next_section(result: Mapping[str, Any], *, said: str = "") -> Section:
     if experiment := result.get("next_experiment"):
         parts += _experiment(experiment)
     return Section("What to do next", parts)
+
+
+def _to_tell_apart(experiment: Any) -> tuple[str, str]:
+    """Returns what to do to tell the causes apart, in a few words and in a sentence."""
+    if isinstance(experiment, Mapping) and experiment.get("excitation", "") is None:
+        if values_that_differ(experiment):
+            told = "No excitation that was tried tells the causes apart."
+            return "measure a parameter in which they differ", told
+    return "record again", "Record what npdr plan designs, and search both recordings together."
 
 
 def _experiment(experiment: Any) -> list[Part]:
@@ -98,7 +109,8 @@ def _experiment(experiment: Any) -> list[Part]:
         hint = f" What separates them in general: {by}." if by else ""
         parts.append(TextPart(f"Next experiment, excitation: {words}.{hint}"))
     if differing := values_that_differ(experiment):
-        parts.append(TextPart(f"Measuring {differing} also tells the causes apart."))
+        also = " also" if experiment.get("excitation") else ""
+        parts.append(TextPart(f"Measuring {differing}{also} tells the causes apart."))
     separations = experiment.get("separations")
     if isinstance(separations, Mapping):
         bars = {
