@@ -56,14 +56,15 @@ def model(inputs):
     return npdr.simulate("swing", simulator(), {"mass": mass, "length": length}, inputs)
 
 
-def recording(num_steps=400, *, delay=0):
+def recording(num_steps=400, *, delay=0, substeps=1):
     rng = np.random.default_rng(0)
     time = STEP * np.arange(num_steps)
     torque = 2.0 * np.sin(3.1 * time) + np.sign(np.sin(5.7 * time))
     late = np.concatenate((np.zeros(delay), torque[: num_steps - delay]))
     values = {"mass": torch.tensor([1.1]), "length": torch.tensor([0.9])}
     start = torch.tensor([[0.3, 0.0]], dtype=torch.float64)
-    states = rod(values, start, torch.tensor(late)[None, :, None], STEP)[0].numpy()
+    held = torch.tensor(late).repeat_interleave(substeps)[None, :, None]
+    states = rod(values, start, held, STEP / substeps)[0, substeps - 1 :: substeps].numpy()
     readings = np.concatenate((start.numpy(), states))
     readings += rng.normal(0.0, [1e-3, 1e-2], readings.shape)
     return npdr.Rollouts.from_arrays(
@@ -178,6 +179,44 @@ def test_dry_friction_that_an_own_function_lacks_is_found():
     search = npdr.DiscoveryOptions(max_effects=1)
     found = npdr.discover(pushed, rollouts, search=search, progress=False)
     assert [finding.effect.name for finding in found.effects] == ["hinge.coulomb_friction"]
+
+
+def test_finer_steps_call_the_function_with_a_part_of_the_time_step():
+    rollouts, coarse = recording(50), simulator()
+    inputs = rollouts.inputs(initial_state="recorded")
+    finer = coarse.with_finer_steps()
+    finest = finer.with_finer_steps()
+    assert finest.with_finer_steps() is None
+    values = {"mass": torch.tensor([1.1]), "length": torch.tensor([0.9])}
+    start = torch.tensor(rollouts.readings[0][:1])
+    actions = inputs.actions.double().reshape(1, -1, 1).repeat_interleave(64, dim=1)
+    exact = rod(values, start, actions, STEP / 64)[:, 63::64]
+    errors = [
+        float((each.simulate(values, inputs).reshape(exact.shape) - exact).abs().max())
+        for each in (coarse, finer, finest)
+    ]
+    assert errors[1] < 0.3 * errors[0]
+    assert errors[2] < 0.1 * errors[1]
+
+
+def test_a_function_that_ignores_the_time_step_has_no_finer_steps():
+    def learned(parameters, initial_state, actions, time_step):
+        return rod(parameters, initial_state, actions, STEP)
+
+    def fragile(parameters, initial_state, actions, time_step):
+        raise ValueError("these states do not suit it")
+
+    assert simulator(learned).with_finer_steps() is None
+    assert simulator(fragile).with_finer_steps() is None
+
+
+@pytest.mark.slow
+def test_coarse_steps_of_an_own_function_do_not_bias_its_parameters():
+    found = npdr.discover(model, recording(substeps=50), seed=0)
+    assert found.verdict == "none"
+    for name, true in (("mass", 1.1), ("length", 0.9)):
+        estimate = found.parameters[name]
+        assert abs(estimate.mean - true) < 3.5 * estimate.sd
 
 
 def test_commands_are_clamped_and_free_motion_needs_none():
