@@ -22,7 +22,8 @@ class Finding:
             their shape.
         alternatives: Probabilities by name, of this effect and of those that could replace it,
             without those that count for it.
-        equivalent_to: Ids of causes that the recording possibly cannot distinguish from it.
+        equivalent_to: Ids of causes that the recording possibly cannot distinguish from it; names
+            of the same law elsewhere.
         share: Share of the misfit that it explains.
         parameters: Its parameters' estimates by short name.
         at_edge: Names of shape parameters with an implausible value, or with a value that the

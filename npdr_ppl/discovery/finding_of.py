@@ -79,12 +79,16 @@ def finding_of(
     ]
     alternatives += added.forms
     known = equivalents(effect, search.final.names)
-    ids = dict.fromkeys([name.rsplit(".", 1)[1] for name in alternatives] + list(known))
+    # The same law at another place is told by its whole name.
+    ids = [name.rsplit(".", 1)[1] for name in alternatives]
+    told = [
+        name if id_ == effect.id else id_ for name, id_ in zip(alternatives, ids, strict=True)
+    ]
     return Finding(
         effect,
         added.probability,
         added.alternatives,
-        tuple(name for name in ids if name != effect.id),
+        tuple(name for name in dict.fromkeys([*told, *known]) if name != effect.id),
         added.share,
         {
             site.removeprefix(f"{effect.name}."): every[site]

@@ -85,7 +85,7 @@ def _bracketed(why: str) -> str:
 
 
 def _others(names: Sequence[Any]) -> str:
-    words = [str(name).replace("_", " ") for name in names]
+    words = [in_words(str(name)).replace("_", " ") for name in names]
     more = len(words) - MOST_ALTERNATIVES
     shown = ", ".join(words[:MOST_ALTERNATIVES])
     return f"{shown} and {more} more" if more > 0 else shown or "–"
