@@ -81,9 +81,7 @@ def finding_of(
     known = equivalents(effect, search.final.names)
     # The same law at another place is told by its whole name.
     ids = [name.rsplit(".", 1)[1] for name in alternatives]
-    told = [
-        name if id_ == effect.id else id_ for name, id_ in zip(alternatives, ids, strict=True)
-    ]
+    told = [name if id_ == effect.id else id_ for name, id_ in zip(alternatives, ids, strict=True)]
     return Finding(
         effect,
         added.probability,

@@ -12,7 +12,7 @@ from npdr_ppl.engines.bullet import BulletSettings, BulletSimulator, Command, Se
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Parameter
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import candidate_effects, effects
+from npdr_ppl.models.effects import Bias, candidate_effects, effects
 from npdr_ppl.models.effects.friction import CoulombFriction, ViscousFriction
 from npdr_ppl.models.pendulum import Pendulum
 from tests.helpers.bullet_models import (
@@ -250,6 +250,22 @@ def test_shorter_segments_are_padded_and_lost_simulations_are_nan(urdf, tmp_path
     lost = model(given)
     assert bool(lost[..., 0, :, :].isnan().all())
     assert bool((lost[..., 1, 40:, :] == 0).all())
+
+
+def test_a_sensor_may_have_its_joint_s_name(urdf):
+    sensors = (
+        Sensor(Channel("hinge", "rad"), "joint hinge position"),
+        Sensor(Channel("velocity", "rad/s", rate_of="hinge"), "joint hinge velocity"),
+    )
+    simulator = bullet_pendulum(urdf, sensors=sensors)
+    assert simulator.port("hinge").kind == "sensor"
+    assert simulator.port("hinge_torque").kind == "force"
+    given = replace(inputs(), channel_names=("hinge", "velocity"))
+    pushed = simulator.with_effects(Bias("hinge_torque"))
+    values = {"hinge_torque.bias.offset": torch.tensor(0.5).double()}
+    usual = bullet_pendulum(urdf).with_effects(Bias("hinge"))
+    same = usual.simulate({"hinge.bias.offset": values["hinge_torque.bias.offset"]}, inputs())
+    assert torch.equal(pushed.simulate(values, given), same)
 
 
 @pytest.mark.parametrize(

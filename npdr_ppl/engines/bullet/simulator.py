@@ -130,10 +130,11 @@ class BulletSimulator(SteppedSimulator):
                     f"{effect.id} cannot attach to {effect.port!r} of {self.name}: it needs "
                     "acceleration and inertia before each step, which Bullet does not give."
                 )
-            if isinstance(effect, ForceEffect) and is_dry(effect) and effect.port in driven:
+            follows = driven.get(self._joint_of.get(effect.port, ""))
+            if isinstance(effect, ForceEffect) and is_dry(effect) and follows:
                 raise ModelError(
                     f"{effect.id} cannot attach to {effect.port!r} of {self.name}: the joint's "
-                    f"motor follows a {driven[effect.port]}, and it would have to be the friction."
+                    f"motor follows a {follows}, and it would have to be the friction."
                 )
         return changed
 
@@ -201,7 +202,7 @@ class BulletSimulator(SteppedSimulator):
         effects = [e for e in self.effects if isinstance(e, ForceEffect)]
         if not effects:
             return None
-        pairs = [(effect, scene.joints[effect.port]) for effect in effects]
+        pairs = [(effect, scene.joints[self._joint_of[effect.port]]) for effect in effects]
         step = segment.time_step / self.settings.substeps
         return JointForces(scene, pairs, parameters, step, segment.start_time)
 
@@ -231,7 +232,11 @@ class BulletSimulator(SteppedSimulator):
         return tuple(possible[name] for name in names)
 
     def _find_ports(self, scene: Scene) -> tuple[Port, ...]:
-        """Returns the ports of a scene."""
+        """Returns the ports of a scene, and notes the joint of each force port.
+
+        A force port has the name of its joint, or ``<joint>_torque`` (``_force`` if it slides) if
+        a channel has that name.
+        """
         rated = {c.place.name: c.rated for _, c in self._commands if c.place.field == "torque"}
         commands = {command.channel.name: command for _, command in self._commands}
         ports = [
@@ -243,6 +248,8 @@ class BulletSimulator(SteppedSimulator):
         for name, joint in scene.joints.items():
             if joint not in of_joint or "/" not in name:
                 of_joint[joint] = name
+        channels = {channel.name for channel in (*self.actions, *self.sensors)}
+        self._joint_of: dict[str, str] = {}
         for joint, name in of_joint.items():
             info = scene.client.getJointInfo(*joint)
             turns = info[2] == scene.client.JOINT_REVOLUTE
@@ -250,7 +257,9 @@ class BulletSimulator(SteppedSimulator):
             # Unspecified limits are zero in a URDF, and sometimes a thousand in Bullet.
             effort = rated.get(name, info[10] if 0.0 < info[10] < 1000.0 else 1.0)
             speed = info[11] if 0.0 < info[11] < 1000.0 else 1.0
-            port = Port(name, "force", unit, effort, speed, 1.0, coordinate, joint in driven)
+            called = f"{name}_{'torque' if turns else 'force'}" if name in channels else name
+            self._joint_of[called] = name
+            port = Port(called, "force", unit, effort, speed, 1.0, coordinate, joint in driven)
             ports.append(port)
         ports += [Port(s.channel.name, "sensor", s.channel.unit, s.rated) for s in self._sensors]
         strength = float(np.linalg.norm(scene.gravity)) or 9.81

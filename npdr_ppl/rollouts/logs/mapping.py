@@ -158,8 +158,19 @@ class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 episodes=_found(log, episodes) if episodes else None,
                 time_step=self.log.time_step,
             )
-            units = self._unit_remarks(log)
-            return replace(recording, notes=(*log.notes, *units, *recording.notes))
+            told = [*self._unit_remarks(log), *self._shared_signals()]
+            return replace(recording, notes=(*log.notes, *told, *recording.notes))
+
+    def _shared_signals(self) -> list[Remark]:
+        """Returns which channels are the same signal, a sentence for each such signal."""
+        by_signal: dict[str, list[str]] = {}
+        for name, entry in self.channels.items():
+            by_signal.setdefault(entry.signal, []).append(name)
+        return [
+            Remark(f"{' and '.join(names)} are the same signal of the log, {signal}.")
+            for signal, names in by_signal.items()
+            if len(names) > 1
+        ]
 
     def _unit_remarks(self, log: Log) -> list[Remark]:
         """Returns what looks wrong about the units of channels and actions, a sentence each."""

@@ -31,6 +31,12 @@ def test_units_signs_and_offsets():
     assert rollouts.action_names == ()
 
 
+def test_a_signal_that_is_two_channels_is_told():
+    twice = {name: {"signal": "/arm/position"} for name in ("angle", "velocity")}
+    (note,) = remarks_among(Mapping.of({"channels": twice}).apply(log()).notes)
+    assert note == "angle and velocity are the same signal of the log, /arm/position."
+
+
 def test_whole_turns_are_subtracted():
     turned = Signal("/arm/position", TIME, np.linspace(30.0, 50.0, 9), "rad")
     entry = {"signal": "/arm/position", "first_turn": True, "offset": 0.5}
