@@ -187,7 +187,10 @@ def test_finer_steps_call_the_function_with_a_part_of_the_time_step():
     finer = coarse.with_finer_steps()
     finest = finer.with_finer_steps()
     assert finest.with_finer_steps() is None
+    assert coarse.with_coarser_steps() is None
+    own = finest.with_coarser_steps()
     values = {"mass": torch.tensor([1.1]), "length": torch.tensor([0.9])}
+    assert torch.equal(own.simulate(values, inputs), coarse.simulate(values, inputs))
     start = torch.tensor(rollouts.readings[0][:1])
     actions = inputs.actions.double().reshape(1, -1, 1).repeat_interleave(64, dim=1)
     exact = rod(values, start, actions, STEP / 64)[:, 63::64]

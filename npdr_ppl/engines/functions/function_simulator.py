@@ -1,6 +1,7 @@
 """A plain function of batched parameters, initial states and actions as a simulator."""
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
@@ -148,6 +149,16 @@ class FunctionSimulator(Simulator):
             return None
         changed = copy.copy(self)
         changed._refinement = FINER * self._refinement
+        return changed
+
+    def with_coarser_steps(
+        self, num_simulations: float = math.inf, time_step: float | None = None
+    ) -> Self | None:
+        """Returns a copy with the function's own steps; ``None`` if these are its steps."""
+        if self._refinement == 1:
+            return None
+        changed = copy.copy(self)
+        changed._refinement = 1
         return changed
 
     @cached_property
