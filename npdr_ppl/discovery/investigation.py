@@ -101,8 +101,8 @@ class Investigation:
         self.seed = seed
         self.progress = SearchProgress(progress)
         self.seconds = self.progress.seconds
-        self._data_options = segment_options(rollouts, options)
-        self._short_options = short_segments(rollouts, options)
+        self._options = options
+        self._recorded_options = segment_options(rollouts, options)
         self._deadline = Deadline(self.settings.time_limit)
 
     @cached_property
@@ -112,7 +112,7 @@ class Investigation:
             found = repair(
                 self.model,
                 self.recorded,
-                self._data_options,
+                self._recorded_options,
                 seed=self.seed,
                 report=self.progress.say,
             )
@@ -148,6 +148,15 @@ class Investigation:
     def remarks(self) -> tuple[str, ...]:
         """How the recording was read, a sentence each; these are no faults."""
         return remarks_among(self.rollouts.notes)
+
+    @cached_property
+    def _data_options(self) -> DataOptions:
+        """How the repaired recording is cut: an unwrapped angle moves less abruptly."""
+        return segment_options(self.rollouts, self._options)
+
+    @cached_property
+    def _short_options(self) -> DataOptions:
+        return short_segments(self.rollouts, self._options)
 
     @cached_property
     def _searcher(self) -> Searcher:

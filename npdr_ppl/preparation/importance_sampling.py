@@ -9,8 +9,8 @@ they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 Along ridges, an ensemble of the draws then moves by Markov chain Monte Carlo, because importance
 sampling gives too little weight to their ends. A polynomial that is fitted to the draws leads it,
 so that few moves suffice; see :mod:`npdr_ppl.preparation.density_surrogate`. There are no moves if
-the first proposal suffices: the posterior is then nearly normal in these coordinates, and the
-proposal's heavy tails reach its ends.
+Laplace's approximation with its heavy tails suffices: the posterior is then nearly normal in these
+coordinates, and the tails reach its ends.
 """
 
 import math
@@ -189,7 +189,8 @@ def sample_posterior(
         adapted = _adapted(w, log_weights, seed, iteration)
         own.append(_Proposal(adapted, settings.draws_per_iteration, space))
     assert result is not None
-    if space.num_weak and result.is_reliable and result.iterations > 1:
+    is_nearly_normal = result.iterations == 1 and not given
+    if space.num_weak and result.is_reliable and not is_nearly_normal:
         return _moved(result, target, likelihood, seed)
     return result
 

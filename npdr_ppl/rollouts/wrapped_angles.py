@@ -1,7 +1,7 @@
 """Adds up whole turns of angles that a log wraps, e.g. headings between −π and π.
 
-A simulated angle counts on when the device turns. A wrapped measurement of it jumps by a whole
-turn, which no parameter explains.
+A simulated angle continues beyond π when the device turns. A wrapped measurement of it jumps by a
+whole turn, which no parameter explains.
 """
 
 import math
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts.arrays import Array
@@ -18,18 +19,19 @@ from npdr_ppl.rollouts.sampling import Sampling
 
 __all__ = ["unwrapped"]
 
-TURNS = {2.0 * math.pi: "rad", 360.0: "degrees"}
-"""A whole turn, and its unit. A log may be in degrees without saying so."""
+TURNS = ((2.0 * math.pi, "rad"), (360.0, "degrees"))
+"""A whole turn in each unit. A log may be in degrees without saying so."""
 
-ROUNDING = 1e-3
-"""By which share of a turn the range of a wrapped angle may exceed it, e.g. by rounding."""
+BEYOND = 0.05
+"""By which share of a turn the range of a wrapped angle may exceed it, because of noise that was
+added later."""
 
-USUAL = 0.99
-"""Share of the other changes between measurements that are at most as large as a usual one."""
+NEARBY = 5
+"""Number of changes before, and after, a jump that tell how fast the device moves."""
 
 SMOOTH = 2.0
-"""Change across a jump, a whole turn subtracted, up to which the motion goes on across it, in
-usual changes."""
+"""Change across a jump, a whole turn subtracted, up to which the motion goes on across it, in the
+largest change nearby."""
 
 INTERPOLATED_NEARBY = 3
 """Number of measurements on either side of a jump around which readings are interpolated anew: a
@@ -37,13 +39,13 @@ reading between measurements depends on three of them on either side."""
 
 
 def unwrapped(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
-    """Returns rollouts in which wrapped angles count on, with a remark about each.
+    """Returns rollouts in which wrapped angles continue beyond a turn, with a remark about each.
 
-    An angle is wrapped if all its values lie within a turn, if it changes by more than half a turn
-    between two measurements, and if most of these changes are smooth once a turn is subtracted.
-    Other changes must be below a quarter of a turn; of faster motion or of noise the turns cannot
-    be told. A channel is left as it is if its declared bounds are within a turn: the simulator
-    wraps it, too.
+    An angle is wrapped if all its values lie within a turn, if it jumps by more than half a turn
+    between two measurements, and if most jumps are no larger than the changes nearby once a turn
+    is subtracted. Nearby changes must be below a quarter of a turn; the turns of faster motion
+    cannot be told. A channel is left as it is if its declared bounds are within a turn: the
+    simulator wraps it, too.
 
     Args:
         rollouts: The recording.
@@ -56,12 +58,12 @@ def unwrapped(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
 
 
 def _channel_unwrapped(rollouts: Rollouts, name: str) -> Rollouts:
-    """Returns rollouts in which one angle counts on, if it is wrapped."""
+    """Returns rollouts with the turns of one angle added up, if it is wrapped."""
     column = rollouts.channel_names.index(name)
     samplings = [rollouts.sampling(index) for index in range(len(rollouts))]
     series = [s.values[s.is_read[:, column], column] for s in samplings]
-    turn = next((turn for turn in TURNS if _is_wrapped(series, turn)), None)
-    if turn is None:
+    turn, unit = next(((t, u) for t, u in TURNS if _is_wrapped(series, t)), (0.0, ""))
+    if not turn:
         return rollouts
     made = [
         _counting_on(readings, sampling, column, turn)
@@ -69,8 +71,8 @@ def _channel_unwrapped(rollouts: Rollouts, name: str) -> Rollouts:
     ]
     low, high = (f(np.concatenate(series)) for f in (np.min, np.max))
     remark = Remark(
-        f"{name} stays between {low:.4g} and {high:.4g} {TURNS[turn]} and jumps by whole turns; "
-        "the turns are added up, so that it counts on."
+        f"{name} stays between {low:.4g} and {high:.4g} {unit} and jumps by whole turns, which "
+        "are added up."
     )
     return replace(
         rollouts,
@@ -83,15 +85,22 @@ def _channel_unwrapped(rollouts: Rollouts, name: str) -> Rollouts:
 def _is_wrapped(series: Sequence[Array], turn: float) -> bool:
     """Returns whether measurements of all rollouts are a wrapped angle."""
     values = np.concatenate(series) if series else np.zeros(0)
-    if not len(values) or np.ptp(values) > (1.0 + ROUNDING) * turn:
+    if not len(values) or np.ptp(values) > (1.0 + BEYOND) * turn:
         return False
-    changes = np.concatenate([np.diff(own) for own in series])
-    is_jump = np.abs(changes) > 0.5 * turn
-    if not is_jump.any() or is_jump.all():
-        return False
-    left = np.abs(changes[is_jump] - turn * np.sign(changes[is_jump]))
-    usual = float(np.quantile(np.abs(changes[~is_jump]), USUAL))
-    return usual < 0.25 * turn and bool(np.mean(left <= SMOOTH * usual) > 0.5)
+    smooth = np.concatenate([_are_smooth(np.diff(own), turn) for own in series])
+    return len(smooth) > 0 and bool(smooth.mean() > 0.5)
+
+
+def _are_smooth(changes: Array, turn: float) -> NDArray[np.bool_]:
+    """Returns for each jump among changes whether it is smooth once a turn is subtracted."""
+    jumps = np.flatnonzero(np.abs(changes) > 0.5 * turn)
+    left = np.abs(changes[jumps] - turn * np.sign(changes[jumps]))
+    others = np.abs(changes)
+    others[jumps] = 0.0
+    padded = np.pad(others, NEARBY)
+    # Row j holds the changes around jump j.
+    largest = padded[jumps[:, None] + np.arange(2 * NEARBY + 1)].max(1, initial=0.0)
+    return (largest < 0.25 * turn) & (left <= SMOOTH * largest)
 
 
 def _counting_on(
@@ -107,8 +116,11 @@ def _counting_on(
     # Between measurements, the number of turns is that of the nearest one.
     nearest = np.searchsorted(0.5 * (place[1:] + place[:-1]), every)
     at_rows = readings[:, column] + (whole - measured)[nearest]
-    jumps = np.flatnonzero(np.abs(np.diff(measured)) > 0.5 * turn)
-    is_near = (np.abs(nearest[:, None] - jumps - 0.5) <= INTERPOLATED_NEARBY).any(1)
+    is_jump = np.abs(np.diff(measured)) > 0.5 * turn
+    # Whether each measurement is one of those around a jump.
+    kernel = np.ones(2 * INTERPOLATED_NEARBY)
+    is_around = np.convolve(is_jump, kernel)[INTERPOLATED_NEARBY - 1 :][: len(measured)] > 0.0
+    is_near = is_around[nearest]
     at_rows[is_near] = np.interp(every[is_near], place, whole)
     changed, values = np.array(readings), np.array(sampling.values)
     changed[:, column] = values[:, column] = at_rows

@@ -16,6 +16,7 @@ from npdr_ppl.discovery.search.effect_search import Searcher
 from npdr_ppl.discovery.search.evidence import log_evidence
 from npdr_ppl.discovery.search.shortlist import fit_shortlist
 from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
 from npdr_ppl.models.effects import (
     Bias,
     Cogging,
@@ -198,13 +199,22 @@ def test_after_a_small_change_the_effects_that_were_added_are_kept(dragged):
     first = searcher.look(base)
     added = searcher.look(searcher.trials.refitted(base, laws[:1]))
     rounds = [first, replace(added, weights={"": 0.5, "hinge.bias": 0.5})]
+    searcher.base = searcher.base.with_model(with_finer_steps(case.model))
     (begun,) = searcher._begun_again(rounds, looks=True)
     again = searcher._begun_again(rounds, looks=False)
     assert begun.hypothesis.names == ()
     assert [round.hypothesis.names for round in again] == [(), ("hinge.quadratic_drag",)]
+    for round in (begun, *again):
+        assert num_finer_steps(round.hypothesis.segments.model) == 1
+        assert not round.weights
+    assert [round.is_stale for round in (begun, *again)] == [False, True, True]
     assert again[1].ranking is added.ranking
     assert not again[1].hopeless & {"hinge.bias"}
-    # The model is the same, and so is what fits best.
+    # The steps were fine enough, so that the same parameters fit best.
     was, now = (r.hypothesis.parameters for r in (added, again[1]))
     for name, value in was.items():
         assert float(now[name]) == pytest.approx(float(value), rel=0.02)
+    # The last round is looked at again before it decides anything.
+    looked = searcher._looked(again[1].hypothesis, again)
+    assert looked is again[-1] and not looked.is_stale and len(again) == 2
+    assert looked.alarm is not added.alarm

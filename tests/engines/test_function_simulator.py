@@ -182,7 +182,8 @@ def test_dry_friction_that_an_own_function_lacks_is_found():
 
 
 def test_finer_steps_call_the_function_with_a_part_of_the_time_step():
-    rollouts, coarse = recording(50), simulator()
+    free = [npdr.Channel("angle", "rad"), npdr.Channel("velocity", "rad/s", rate_of="angle")]
+    rollouts, coarse = recording(50), simulator(states=free)
     inputs = rollouts.inputs(initial_state="recorded")
     finer = coarse.with_finer_steps()
     finest = finer.with_finer_steps()
@@ -206,11 +207,59 @@ def test_a_function_that_ignores_the_time_step_has_no_finer_steps():
     def learned(parameters, initial_state, actions, time_step):
         return rod(parameters, initial_state, actions, STEP)
 
+    def lag(parameters, initial_state, actions, time_step):
+        """Two steps of it change the state by only 1.3 times as much as one."""
+        state, states = initial_state, []
+        for action in actions.unbind(1):
+            state = 0.3 * state + 0.7 * action
+            states.append(state)
+        return torch.stack(states, dim=1)
+
     def fragile(parameters, initial_state, actions, time_step):
         raise ValueError("these states do not suit it")
 
     assert simulator(learned).with_finer_steps() is None
     assert simulator(fragile).with_finer_steps() is None
+    assert simulator(lag).with_finer_steps() is None
+
+
+def test_bounded_states_are_not_extrapolated_and_forces_act_in_finer_steps():
+    def turning(parameters, initial_state, actions, time_step, forces):
+        """A heading between −π and π, in Euler steps."""
+        heading, rate = initial_state.unbind(-1)
+        states = []
+        for k in range(actions.shape[1]):
+            heading = torch.remainder(heading + time_step * rate + math.pi, 2 * math.pi) - math.pi
+            rate = rate + time_step * (actions[:, k, 0] + forces[:, k, 0])
+            states.append(torch.stack([heading, rate], dim=-1))
+        return torch.stack(states, dim=1)
+
+    wrapped = npdr.FunctionSimulator(
+        turning,
+        states=[
+            npdr.Channel("angle", "rad", -math.pi, math.pi),
+            npdr.Channel("velocity", "rad/s", rate_of="angle"),
+        ],
+        actions=[npdr.Channel("torque", "N m", -4.5, 4.5)],
+        parameters=[],
+        time_step=STEP,
+        forces={"angle": npdr.Port("base", "force", "N m", 4.5, 5.0)},
+    )
+    rollouts = recording(400)
+    inputs = rollouts.inputs(initial_state="recorded")
+    slowed = wrapped.with_effects(ViscousFriction("base"))
+    drag = {"base.viscous_friction.damping": torch.tensor(0.4).double()}
+    finest = slowed.with_finer_steps().with_finer_steps()
+    errors = []
+    for simulated in (slowed, finest):
+        angle, rate = simulated.simulate(drag, inputs)[0].unbind(-1)
+        assert float(angle.abs().max()) <= math.pi + 1e-9
+        # The rate follows ω' = u − c ω, step by step.
+        decay, exact = math.exp(-0.4 * STEP), [inputs.initial_values[0, 1].double()]
+        for torque in inputs.actions[0, :, 0].double():
+            exact.append(exact[-1] * decay + torque * (1.0 - decay) / 0.4)
+        errors.append(float((rate - torch.stack(exact[1:])).abs().max()))
+    assert errors[1] < 0.1 * errors[0]
 
 
 @pytest.mark.slow

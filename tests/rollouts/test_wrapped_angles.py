@@ -1,4 +1,4 @@
-"""Angles that a log wraps count on; other measurements are left as they are."""
+"""The turns of angles that a log wraps are added up; other measurements are left as they are."""
 
 from dataclasses import replace
 
@@ -74,13 +74,22 @@ def test_late_and_missing_measurements_do_not_blur_a_jump(tmp_path):
     assert np.abs(np.diff(values)).max() < 0.5
 
 
+def test_short_turns_noise_and_dropouts_do_not_hide_a_wrapped_angle():
+    rng = np.random.default_rng(2)
+    true = np.concatenate((np.zeros(2000), np.linspace(0.0, 4.0, 40), np.full(2000, 4.0)))
+    noisy = wrapped(true) + rng.normal(0.0, 0.02, len(true))
+    noisy[500:509] = 0.0
+    (found,) = unwrapped(recorded(noisy), [HEADING])
+    assert np.abs(np.delete(found.readings[0][:, 0] - true, slice(500, 509))).max() < 0.1
+
+
 @pytest.mark.parametrize(
     "values",
     [
         3.1 * np.sign(np.sin(np.arange(800) * 0.1)),  # a rectangle
         np.random.default_rng(0).uniform(-3.0, 3.0, 800),  # nothing but noise
         np.where(np.arange(800) == 400, -2.0, 2.0) + 0.01 * np.sin(np.arange(800)),  # a spike
-        motion(0.0),  # counts on already
+        motion(0.0),  # its turns are added up already
     ],
 )
 def test_other_measurements_are_left_as_they_are(values):

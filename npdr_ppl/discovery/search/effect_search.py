@@ -196,8 +196,8 @@ class Searcher(OriginalModel):
         Args:
             rounds: The rounds in coarser steps, or with wider priors.
             looks: Whether to begin with the first round and to screen the candidates again,
-                because others could now explain most. In narrower priors, only those can explain
-                as much that did before. The rounds then only get their model fitted again.
+                because others could now explain most. Otherwise, the rounds keep their effects
+                and candidates, and only their models are fitted again.
         """
         first = rounds[0]
         fitted = self.fit_base(near=first.hypothesis.parameters)
@@ -267,9 +267,17 @@ class Searcher(OriginalModel):
         )
 
     def _looked(self, current: Hypothesis, rounds: list[Round]) -> Round:
-        """Returns the last round, after one is added if it has other effects than a hypothesis."""
-        if set(current.names) != set(rounds[-1].hypothesis.names):
+        """Returns the last round, after one is added if it has other effects than a hypothesis.
+
+        A round whose model was fitted again is looked at again.
+        """
+        last = rounds[-1]
+        if set(current.names) != set(last.hypothesis.names):
             rounds.append(self.look(current))
+        elif last.is_stale:
+            seen = self.look(last.hypothesis)
+            tried = {"hopeless": last.hopeless, "weights": last.weights, "trials": last.trials}
+            rounds[-1] = replace(seen, **tried)
         return rounds[-1]
 
     def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
@@ -454,6 +462,7 @@ def _with_model(before: Round, fitted: Hypothesis) -> Round:
         weights={},
         trials={},
         hopeless=before.hopeless | hopeless,
+        is_stale=True,
     )
 
 

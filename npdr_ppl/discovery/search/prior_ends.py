@@ -55,9 +55,8 @@ class PriorEnd:
 
     def __str__(self) -> str:
         return (
-            f"{self.name} fits better {'below' if self.end == 'lower' else 'above'} its prior, "
-            f"{self.prior}; the fit with wider priors gives about {self.closest:.4g}: widen the "
-            "prior"
+            f"{self.name} fits best at about {self.closest:.4g} with wider priors, beyond the "
+            f"{self.end} 0.1 % of its prior, {self.prior}: widen the prior"
         )
 
 

@@ -32,6 +32,7 @@ class Round:
         hopeless: Candidates that need not be fitted in full, by name.
         weights: Probability of each candidate fitted in full, by name; ``""`` for no effect.
         trials: The model with each of these candidates, by name.
+        is_stale: Whether the model was fitted again, in other steps or priors, after the test.
     """
 
     hypothesis: Hypothesis
@@ -45,6 +46,7 @@ class Round:
     hopeless: frozenset[str] = frozenset()
     weights: dict[str, float] = field(default_factory=dict)
     trials: dict[str, Hypothesis] = field(default_factory=dict)
+    is_stale: bool = False
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,14 @@ FINER, FINEST = 4, 16
 """Steps in place of one: by how much one refinement increases their number, and the most."""
 
 MOST_CHANGED = 0.5
-"""By how much two halves of a step may differ from the step, as a share of its change, if a
-function heeds the time step. Of one that does not, they change the state about twice as much."""
+"""By how much two halves of a step may differ from the whole, as a share of its change, if a
+function uses the time step."""
+
+LEAST_CHANGED = 0.1
+"""By how much one half must differ from it. Without use of the time step it is the same."""
 
 NUM_PROBES = 16
-"""Number of random states and actions from which this is tried."""
+"""Number of random states and actions from which both are tried."""
 
 BatchedFunction = Callable[..., Tensor]
 """``f(parameters, initial_state, actions, time_step)``: parameters by name, ``(N,)`` each; initial
@@ -44,7 +47,7 @@ class FunctionSimulator(Simulator):
     on forces attach if the function takes forces: it is then called for one step at a time, from
     the state after the one before, so it must not depend on earlier steps otherwise. Where the
     function's own integration is too coarse for a recording, it is called with shorter steps, if
-    it heeds the time step.
+    it uses the time step.
 
     Args:
         function: The function, see :data:`BatchedFunction`. It gets float64 tensors.
@@ -143,9 +146,9 @@ class FunctionSimulator(Simulator):
         """Returns a copy that calls the function with a quarter of the time step.
 
         The finest steps are extrapolated from an eighth and a sixteenth. ``None`` if the steps are
-        the finest, or if the function does not heed the time step.
+        the finest, or if the function does not use the time step.
         """
-        if self._refinement >= FINEST or not self._heeds_time_step:
+        if self._refinement >= FINEST or not self._uses_time_step:
             return None
         changed = copy.copy(self)
         changed._refinement = FINER * self._refinement
@@ -162,8 +165,8 @@ class FunctionSimulator(Simulator):
         return changed
 
     @cached_property
-    def _heeds_time_step(self) -> bool:
-        """Whether two halves of a step lead about where the step leads, from random states."""
+    def _uses_time_step(self) -> bool:
+        """Whether two halves of a step lead about where the whole leads, and one does not."""
         generator = torch.Generator().manual_seed(0)
 
         def drawn(channels: Sequence[Channel]) -> Tensor:
@@ -180,17 +183,18 @@ class FunctionSimulator(Simulator):
         }
         forces = states.new_zeros(NUM_PROBES, 1, len(self.forces))
         step, changes = self.time_step, []
-        for num in (1, 2):
+        for num, length in ((1, step), (1, step / 2), (2, step / 2)):
             held, none = (part.expand(-1, num, -1) for part in (actions, forces))
             try:
-                ends = self._called(nominal, states, held, step / num, none)
+                ends = self._called(nominal, states, held, length, none)
             except Exception:  # the function is the user's, and random states may not suit it
                 return False
             changes.append(ends[:, -1] - states)
-        whole, halves = changes
-        size = whole.square().mean(0).sqrt()
-        differs = (halves - whole).square().mean(0).sqrt()
-        return bool((differs <= MOST_CHANGED * size).all())
+        size, half, halves = (
+            (change - other).square().mean(0).sqrt()
+            for change, other in zip(changes, (0.0, changes[0], changes[0]), strict=True)
+        )
+        return bool((halves <= MOST_CHANGED * size).all() & (half > LEAST_CHANGED * size).any())
 
     def simulate(self, parameters: Mapping[str, Tensor], inputs: Inputs) -> Tensor:
         """Replays the inputs' actions; see :meth:`Simulator.simulate`.
@@ -208,53 +212,43 @@ class FunctionSimulator(Simulator):
         own = {p.name: domain[p.name].expand(shape).reshape(-1) for p in self.parameters}
         step, actions = inputs.time_step, signals.actions()
         laws = tuple(effect for effect in self.effects if isinstance(effect, ForceEffect))
-        if laws:
-            forced = copy.copy(self)
-            forced.effects = laws
+        forced = copy.copy(self)
+        forced.effects = laws
+        own_tables = tuple(law.own_parameters(domain) for law in laws)
+        tables = flatten(own_tables, shape, expand=True) if laws else ()
+
+        def moved(num: int) -> Tensor:
+            """Returns the states after each step, of which each is taken in equal parts."""
+            held, length = actions.repeat_interleave(num, dim=1), step / num
+            if not laws:
+                none = held.new_zeros(*held.shape[:2], len(self.forces))
+                return self._called(own, initial_states, held, length, none)[:, num - 1 :: num]
 
             def advance(states: Tensor, action: Tensor, forces: Tensor) -> Tensor:
-                return self._run(own, states, action[:, None], step, forces[:, None])[:, 0]
+                return self._called(own, states, action[:, None], length, forces[:, None])[:, 0]
 
-            motion = ForcedMotion(forced, self._joints, self._rates, advance, step)
-            tables = flatten(tuple(law.own_parameters(domain) for law in laws), shape, expand=True)
-            values = motion.run(tables, initial_states, actions, signals.start_times)
-        else:
-            none = actions.new_zeros(*actions.shape[:2], len(self.forces))
-            values = self._run(own, initial_states, actions, step, none)
+            motion = ForcedMotion(forced, self._joints, self._rates, advance, length)
+            states = motion.run(tables, initial_states, held, signals.start_times)
+            return states[:, num - 1 :: num]
+
+        values = moved(self._refinement)
+        if self._refinement >= FINEST:
+            # Errors of simple integrators are proportional to the step, and cancel in this
+            # difference (Richardson's extrapolation). A state within bounds may jump, as a wrapped
+            # angle does, or must not leave them.
+            values = torch.where(
+                self._is_bounded, values, 2.0 * values - moved(self._refinement // 2)
+            )
         readings = signals.readings(values, initial_states)
         readings = readings.reshape(*shape, *readings.shape[1:])
         readings = torch.where(inputs.mask[..., None], readings, torch.zeros_like(readings))
         return readings.to(dtype)
 
-    def _run(
-        self,
-        parameters: dict[str, Tensor],
-        initial_states: Tensor,
-        actions: Tensor,
-        step: float,
-        forces: Tensor,
-    ) -> Tensor:
-        """Returns the states after each step, ``(N, steps, states)``."""
-        given, num = (parameters, initial_states, actions, step, forces), self._refinement
-        if num < FINEST:
-            return self._in_parts(*given, num)
-        # Errors of simple integrators are proportional to the step, and cancel in this difference
-        # (Richardson's extrapolation).
-        return 2.0 * self._in_parts(*given, num) - self._in_parts(*given, num // 2)
-
-    def _in_parts(
-        self,
-        parameters: dict[str, Tensor],
-        initial_states: Tensor,
-        actions: Tensor,
-        step: float,
-        forces: Tensor,
-        num: int,
-    ) -> Tensor:
-        """Returns the states after each step, of which the function takes each in equal parts."""
-        actions, forces = (part.repeat_interleave(num, dim=1) for part in (actions, forces))
-        states = self._called(parameters, initial_states, actions, step / num, forces)
-        return states[:, num - 1 :: num]
+    @property
+    def _is_bounded(self) -> Tensor:
+        """Which states have a declared bound."""
+        bounds = torch.tensor([[state.lower, state.upper] for state in self.states])
+        return bounds.isfinite().any(1)
 
     def _called(
         self,
