@@ -186,10 +186,9 @@ def test_finer_steps_call_the_function_with_a_part_of_the_time_step():
     rollouts, coarse = recording(50), simulator(states=free)
     inputs = rollouts.inputs(initial_state="recorded")
     finer = coarse.with_finer_steps()
-    finest = finer.with_finer_steps()
-    assert finest.with_finer_steps() is None
+    assert finer.with_finer_steps() is None
     assert coarse.with_coarser_steps() is None
-    own = finest.with_coarser_steps()
+    own = finer.with_coarser_steps()
     values = {"mass": torch.tensor([1.1]), "length": torch.tensor([0.9])}
     assert torch.equal(own.simulate(values, inputs), coarse.simulate(values, inputs))
     start = torch.tensor(rollouts.readings[0][:1])
@@ -197,10 +196,9 @@ def test_finer_steps_call_the_function_with_a_part_of_the_time_step():
     exact = rod(values, start, actions, STEP / 64)[:, 63::64]
     errors = [
         float((each.simulate(values, inputs).reshape(exact.shape) - exact).abs().max())
-        for each in (coarse, finer, finest)
+        for each in (coarse, finer)
     ]
-    assert errors[1] < 0.3 * errors[0]
-    assert errors[2] < 0.1 * errors[1]
+    assert errors[1] < 0.1 * errors[0]
 
 
 def test_a_function_that_ignores_the_time_step_has_no_finer_steps():
@@ -223,7 +221,7 @@ def test_a_function_that_ignores_the_time_step_has_no_finer_steps():
     assert simulator(lag).with_finer_steps() is None
 
 
-def test_bounded_states_are_not_extrapolated_and_forces_act_in_finer_steps():
+def test_wrapped_states_stay_within_their_bounds_and_forces_act_in_finer_steps():
     def turning(parameters, initial_state, actions, time_step, forces):
         """A heading between −π and π, in Euler steps."""
         heading, rate = initial_state.unbind(-1)
@@ -249,9 +247,9 @@ def test_bounded_states_are_not_extrapolated_and_forces_act_in_finer_steps():
     inputs = rollouts.inputs(initial_state="recorded")
     slowed = wrapped.with_effects(ViscousFriction("base"))
     drag = {"base.viscous_friction.damping": torch.tensor(0.4).double()}
-    finest = slowed.with_finer_steps().with_finer_steps()
+    finer = slowed.with_finer_steps()
     errors = []
-    for simulated in (slowed, finest):
+    for simulated in (slowed, finer):
         angle, rate = simulated.simulate(drag, inputs)[0].unbind(-1)
         assert float(angle.abs().max()) <= math.pi + 1e-9
         # The rate follows ω' = u − c ω, step by step.
@@ -259,7 +257,7 @@ def test_bounded_states_are_not_extrapolated_and_forces_act_in_finer_steps():
         for torque in inputs.actions[0, :, 0].double():
             exact.append(exact[-1] * decay + torque * (1.0 - decay) / 0.4)
         errors.append(float((rate - torch.stack(exact[1:])).abs().max()))
-    assert errors[1] < 0.1 * errors[0]
+    assert errors[1] < 0.3 * errors[0]
 
 
 @pytest.mark.slow

@@ -20,8 +20,13 @@ from npdr_ppl.language.simulator import Simulator
 
 __all__ = ["BatchedFunction", "FunctionSimulator"]
 
-FINER, FINEST = 4, 16
-"""Steps in place of one: by how much one refinement increases their number, and the most."""
+FINER = 4
+"""Finer steps in place of one, an even number. The time of a function in Python is proportional to
+it."""
+
+JUMP = 0.25
+"""Difference between results in two step lengths, as a share of a state's range, above which the
+state jumps."""
 
 MOST_CHANGED = 0.5
 """By how much two halves of a step may differ from the whole, as a share of its change, if a
@@ -86,8 +91,8 @@ class FunctionSimulator(Simulator):
         'fall'
     """
 
-    _refinement: int = 1
-    """Steps of the function in each time step."""
+    _is_fine: bool = False
+    """Whether the function is called with parts of the time step."""
 
     def __init__(
         self,
@@ -143,25 +148,25 @@ class FunctionSimulator(Simulator):
         return super().with_effects(*effects)
 
     def with_finer_steps(self) -> Self | None:
-        """Returns a copy that calls the function with a quarter of the time step.
+        """Returns a copy that calls the function with half and a quarter of the time step.
 
-        The finest steps are extrapolated from an eighth and a sixteenth. ``None`` if the steps are
-        the finest, or if the function does not use the time step.
+        The result is extrapolated from both. ``None`` if it does so already, or if the function
+        does not use the time step.
         """
-        if self._refinement >= FINEST or not self._uses_time_step:
+        if self._is_fine or not self._uses_time_step:
             return None
         changed = copy.copy(self)
-        changed._refinement = FINER * self._refinement
+        changed._is_fine = True
         return changed
 
     def with_coarser_steps(
         self, num_simulations: float = math.inf, time_step: float | None = None
     ) -> Self | None:
         """Returns a copy with the function's own steps; ``None`` if these are its steps."""
-        if self._refinement == 1:
+        if not self._is_fine:
             return None
         changed = copy.copy(self)
-        changed._refinement = 1
+        changed._is_fine = False
         return changed
 
     @cached_property
@@ -231,24 +236,30 @@ class FunctionSimulator(Simulator):
             states = motion.run(tables, initial_states, held, signals.start_times)
             return states[:, num - 1 :: num]
 
-        values = moved(self._refinement)
-        if self._refinement >= FINEST:
-            # Errors of simple integrators are proportional to the step, and cancel in this
-            # difference (Richardson's extrapolation). A state within bounds may jump, as a wrapped
-            # angle does, or must not leave them.
-            values = torch.where(
-                self._is_bounded, values, 2.0 * values - moved(self._refinement // 2)
-            )
+        values = moved(FINER if self._is_fine else 1)
+        if self._is_fine:
+            values = self._extrapolated(moved(FINER // 2), values)
         readings = signals.readings(values, initial_states)
         readings = readings.reshape(*shape, *readings.shape[1:])
         readings = torch.where(inputs.mask[..., None], readings, torch.zeros_like(readings))
         return readings.to(dtype)
 
-    @property
-    def _is_bounded(self) -> Tensor:
-        """Which states have a declared bound."""
-        bounds = torch.tensor([[state.lower, state.upper] for state in self.states])
-        return bounds.isfinite().any(1)
+    def _extrapolated(self, rough: Tensor, fine: Tensor) -> Tensor:
+        """Returns states without the error that is proportional to the step (Richardson 1911).
+
+        Where a state jumps within its bounds, as a wrapped angle does, it is left as it is. No
+        state is moved beyond its bounds.
+
+        Args:
+            rough: The states in steps of twice the length, ``(N, steps, states)``.
+            fine: The states.
+        """
+        bounds = torch.tensor([[state.lower, state.upper] for state in self.states]).to(fine)
+        lower, upper = bounds.unbind(1)
+        change = fine - rough
+        jumps = change.abs() > JUMP * (upper - lower)
+        moved = fine + torch.where(jumps, 0.0, change)
+        return moved.maximum(lower.minimum(fine)).minimum(upper.maximum(fine))
 
     def _called(
         self,
