@@ -86,10 +86,10 @@ def with_breaks(
         time: Seconds, ``(T,)``.
         columns: Values at these times, ``(T,)`` each.
     """
-    steps = np.diff(time)
-    breaks = 1 + np.flatnonzero(steps > GAP * np.median(steps)) if len(steps) else steps
-    if not len(breaks):
+    if len(time) < 2:
         return time, *columns
+    steps = np.diff(time)
+    breaks = 1 + np.flatnonzero(steps > GAP * np.median(steps))
     return tuple(np.insert(each, breaks, np.nan) for each in (time, *columns))
 
 
