@@ -10,7 +10,7 @@ from npdr_ppl.discovery.headline import headline
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.proof.settings import GAP
 from npdr_ppl.drawing.bars_html import gap_bars
-from npdr_ppl.drawing.effect_names import effect_title, in_words
+from npdr_ppl.drawing.effect_names import cause_in_words, effect_title
 from npdr_ppl.drawing.html import table
 from npdr_ppl.drawing.numbers import number
 from npdr_ppl.drawing.overlay_html import lead_html
@@ -167,7 +167,7 @@ def _effect_rows(found: Mapping[str, Any]) -> list[list[str]]:
         number(found.get("probability"), ".0%"),
     )
     others = found.get("equivalent_to") or []
-    rows[0][-1] = ", ".join(in_words(str(name)).replace("_", " ") for name in others) or "–"
+    rows[0][-1] = ", ".join(cause_in_words(str(name)) for name in others) or "–"
     return rows
 
 

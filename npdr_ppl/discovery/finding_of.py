@@ -79,14 +79,15 @@ def finding_of(
     ]
     alternatives += added.forms
     known = equivalents(effect, search.final.names)
-    # The same law at another place is told by its whole name.
-    ids = [name.rsplit(".", 1)[1] for name in alternatives]
-    told = [name if id_ == effect.id else id_ for name, id_ in zip(alternatives, ids, strict=True)]
+    # An id is enough, except for the same law at another place.
+    causes = [
+        name if name.endswith(f".{effect.id}") else name.rsplit(".", 1)[1] for name in alternatives
+    ]
     return Finding(
         effect,
         added.probability,
         added.alternatives,
-        tuple(name for name in dict.fromkeys([*told, *known]) if name != effect.id),
+        tuple(name for name in dict.fromkeys([*causes, *known]) if name != effect.id),
         added.share,
         {
             site.removeprefix(f"{effect.name}."): every[site]

@@ -7,7 +7,15 @@ from typing import Any
 
 from npdr_ppl.drawing.numbers import number
 
-__all__ = ["TITLES", "effect_label", "effect_title", "in_words", "quantity", "why_unnamed"]
+__all__ = [
+    "TITLES",
+    "cause_in_words",
+    "effect_label",
+    "effect_title",
+    "in_words",
+    "quantity",
+    "why_unnamed",
+]
 
 TITLES = {
     "actuator_gain": "{where} gain error",
@@ -136,6 +144,11 @@ def in_words(text: str) -> str:
     found = re.compile(rf"([\w,]+)\.({ids})\b")
     text = found.sub(lambda m: effect_title(m.group(2), m.group(1)), text)
     return _CHANNEL.sub(lambda m: m.group().replace("_", " "), text)
+
+
+def cause_in_words(name: str) -> str:
+    """Returns an entry of ``equivalent_to`` in words: an id, or the whole name of an effect."""
+    return in_words(name).replace("_", " ")
 
 
 def _where(port: str) -> str:

@@ -66,7 +66,7 @@ def _channel_unwrapped(rollouts: Rollouts, name: str) -> Rollouts:
     if not turn:
         return rollouts
     made = [
-        _counting_on(readings, sampling, column, turn)
+        _with_turns_added(readings, sampling, column, turn)
         for readings, sampling in zip(rollouts.readings, samplings, strict=True)
     ]
     low, high = (f(np.concatenate(series)) for f in (np.min, np.max))
@@ -103,7 +103,7 @@ def _are_smooth(changes: Array, turn: float) -> NDArray[np.bool_]:
     return (largest < 0.25 * turn) & (left <= SMOOTH * largest)
 
 
-def _counting_on(
+def _with_turns_added(
     readings: Array, sampling: Sampling, column: int, turn: float
 ) -> tuple[Array, Sampling]:
     """Returns readings and measurements of a rollout, with an angle's turns added up."""

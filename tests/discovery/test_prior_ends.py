@@ -86,8 +86,8 @@ def test_a_prior_of_one_element_counts_as_a_scalar():
 def test_an_end_is_said_in_one_sentence_with_what_to_do():
     end = PriorEnd("length", "upper", "Uniform(0.3, 0.75)", 0.89957)
     assert str(end) == (
-        "length fits best at about 0.8996 with wider priors, beyond the upper 0.1 % of its prior, "
-        "Uniform(0.3, 0.75): widen the prior"
+        "length fits best at about 0.8996 with wider priors, at or beyond the upper end of its "
+        "prior, Uniform(0.3, 0.75): widen the prior"
     )
 
 

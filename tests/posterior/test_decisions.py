@@ -93,7 +93,7 @@ def prepared_as(result):
 def test_a_prior_that_excludes_the_truth_is_to_be_widened(clean, quick):
     _, diagnosis = fitted(too_short, clean, quick)
     assert diagnosis["decision"] == Decision.WIDEN
-    assert "beyond the upper 0.1 % of its prior, Uniform(0.3, 0.75)" in diagnosis["reason"]
+    assert "beyond the upper end of its prior, Uniform(0.3, 0.75)" in diagnosis["reason"]
     found = npdr.discover(too_short, clean)
     assert found.effects == []
     assert found.reason.startswith("length fits best at about")

@@ -121,7 +121,7 @@ def test_data_that_say_nothing_call_for_another_rollout():
 
 def test_a_decision_is_taken_once_the_reasons_before_it_are_excluded():
     model = {"p_value": 1e-4, "fired": True, "strongest": "drag", "misfit": 3.0}
-    prior = "length fits best at 0.2, beyond the lower 0.1 % of its prior: widen the prior"
+    prior = "length fits best at 0.2, beyond the lower end of its prior: widen the prior"
     estimator = {"pareto_k": 2.0, "is_reliable": False, "is_corrected": True}
     wrong = {"sd": 0.5, "members_differ": 1.0}
 

@@ -22,7 +22,13 @@ from npdr_ppl.discovery.search.look import look
 from npdr_ppl.discovery.search.original_model import OriginalModel
 from npdr_ppl.discovery.search.parsimony import plausible_laws, simplest_laws
 from npdr_ppl.discovery.search.repeatability import repeated_effects
-from npdr_ppl.discovery.search.rounds import Round, Search, is_negligible, is_something_left
+from npdr_ppl.discovery.search.rounds import (
+    Round,
+    Search,
+    is_negligible,
+    is_single_addition,
+    is_something_left,
+)
 from npdr_ppl.discovery.search.settings import EVIDENCE, SEARCH, TRIALS
 from npdr_ppl.discovery.search.shortlist import fit_shortlist
 from npdr_ppl.discovery.segment_options import segment_options
@@ -202,14 +208,13 @@ class Searcher(OriginalModel):
         first = rounds[0]
         fitted = self.fit_base(near=first.hypothesis.parameters)
         if looks:
-            hopeless = {name for name, w in first.weights.items() if w < SEARCH.hopeless}
-            return [replace(self.look(fitted), hopeless=frozenset(hopeless))]
-        again = [_with_model(first, fitted)]
+            return [replace(self.look(fitted), hopeless=first.far_behind)]
+        again = [first.refitted(fitted)]
         for before in rounds[1:]:
             found = self.trials.refitted(before.hypothesis)
             if found is None:
                 break
-            again.append(_with_model(before, self.trials.with_own_starts(found)))
+            again.append(before.refitted(self.trials.with_own_starts(found)))
         return again
 
     def _revised(self, current: Hypothesis, rounds: list[Round], max_effects: int) -> Search:
@@ -276,8 +281,9 @@ class Searcher(OriginalModel):
             rounds.append(self.look(current))
         elif last.is_stale:
             seen = self.look(last.hypothesis)
-            tried = {"hopeless": last.hopeless, "weights": last.weights, "trials": last.trials}
-            rounds[-1] = replace(seen, **tried)
+            rounds[-1] = replace(
+                seen, hopeless=last.hopeless, weights=last.weights, trials=last.trials
+            )
         return rounds[-1]
 
     def look(self, hypothesis: Hypothesis, *, number: int | None = None) -> Round:
@@ -360,7 +366,7 @@ class Searcher(OriginalModel):
             current: The model after the last round's addition, if there was one.
             max_effects: Greatest number of effects.
         """
-        asked = [rounds[-2]] if _is_single_addition(rounds) else []
+        asked = [rounds[-2]] if is_single_addition(rounds) else []
         is_full = num_counted(current.effects) >= max_effects
         if current is rounds[-1].hypothesis or is_full:
             asked.append(rounds[-1])
@@ -383,7 +389,7 @@ class Searcher(OriginalModel):
             current: The model after the last round's addition, if there was one.
             max_effects: Greatest number of effects.
         """
-        if not _is_single_addition(rounds):
+        if not is_single_addition(rounds):
             return current
         before, after = rounds[-2], rounds[-1].hypothesis
         new = set(after.names) - set(before.hypothesis.names)
@@ -444,33 +450,6 @@ class Searcher(OriginalModel):
                 self._report(f"removing {effect.name}")
                 current = without
         return current
-
-
-def _with_model(before: Round, fitted: Hypothesis) -> Round:
-    """Returns a round whose model was fitted again, without what was tried.
-
-    Args:
-        before: The round.
-        fitted: The model.
-    """
-    hopeless = {name for name, weight in before.weights.items() if weight < SEARCH.hopeless}
-    hopeless |= {c.name for c in before.ranking if c.name not in before.weights}
-    return replace(
-        before,
-        hypothesis=fitted,
-        averaged=fitted.averaged(),
-        weights={},
-        trials={},
-        hopeless=before.hopeless | hopeless,
-        is_stale=True,
-    )
-
-
-def _is_single_addition(rounds: list[Round]) -> bool:
-    """Returns whether the last round's model has one effect that the one before has not."""
-    if len(rounds) < 2:
-        return False
-    return len(set(rounds[-1].hypothesis.names) - set(rounds[-2].hypothesis.names)) == 1
 
 
 def _speaks_for(one: Hypothesis, other: Hypothesis) -> float:

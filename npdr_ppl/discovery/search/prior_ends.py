@@ -55,8 +55,8 @@ class PriorEnd:
 
     def __str__(self) -> str:
         return (
-            f"{self.name} fits best at about {self.closest:.4g} with wider priors, beyond the "
-            f"{self.end} 0.1 % of its prior, {self.prior}: widen the prior"
+            f"{self.name} fits best at about {self.closest:.4g} with wider priors, at or beyond "
+            f"the {self.end} end of its prior, {self.prior}: widen the prior"
         )
 
 

@@ -1,6 +1,7 @@
 """The rounds of a search and its result."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
@@ -12,7 +13,14 @@ from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.evidence import closest
 from npdr_ppl.discovery.search.settings import SEARCH
 
-__all__ = ["Round", "Search", "explained", "is_negligible", "is_something_left"]
+__all__ = [
+    "Round",
+    "Search",
+    "explained",
+    "is_negligible",
+    "is_single_addition",
+    "is_something_left",
+]
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,30 @@ class Round:
     weights: dict[str, float] = field(default_factory=dict)
     trials: dict[str, Hypothesis] = field(default_factory=dict)
     is_stale: bool = False
+
+    @property
+    def far_behind(self) -> frozenset[str]:
+        """Candidates whose full fit was so bad that no small change can help, by name."""
+        return frozenset(name for name, w in self.weights.items() if w < SEARCH.hopeless)
+
+    def refitted(self, hypothesis: Hypothesis) -> "Round":
+        """Returns the round with its model fitted again, without what was tried.
+
+        Candidates that were far behind or did not come to a full fit are hopeless.
+
+        Args:
+            hypothesis: The model in other steps or priors.
+        """
+        not_fitted = {c.name for c in self.ranking if c.name not in self.weights}
+        return replace(
+            self,
+            hypothesis=hypothesis,
+            averaged=hypothesis.averaged(),
+            weights={},
+            trials={},
+            hopeless=self.hopeless | self.far_behind | not_fitted,
+            is_stale=True,
+        )
 
 
 @dataclass(frozen=True)
@@ -99,6 +131,13 @@ def is_something_left(first: Round, now: Round) -> bool:
         for candidate in now.ranking
         if candidate.name in now.shares and alarm.p_values[candidate.name] <= alarm.limit
     )
+
+
+def is_single_addition(rounds: Sequence[Round]) -> bool:
+    """Returns whether the last round's model has one effect that the one before has not."""
+    if len(rounds) < 2:
+        return False
+    return len(set(rounds[-1].hypothesis.names) - set(rounds[-2].hypothesis.names)) == 1
 
 
 def is_negligible(first: Hypothesis, current: Hypothesis, extended: Hypothesis) -> bool:

@@ -12,7 +12,13 @@ from npdr_ppl.display.reports.content import (
     TextPart,
 )
 from npdr_ppl.drawing.bars_html import named_bars
-from npdr_ppl.drawing.effect_names import effect_label, effect_title, in_words, why_unnamed
+from npdr_ppl.drawing.effect_names import (
+    cause_in_words,
+    effect_label,
+    effect_title,
+    in_words,
+    why_unnamed,
+)
 from npdr_ppl.drawing.numbers import number
 
 __all__ = ["effects_section", "estimates_section"]
@@ -85,7 +91,7 @@ def _bracketed(why: str) -> str:
 
 
 def _others(names: Sequence[Any]) -> str:
-    words = [in_words(str(name)).replace("_", " ") for name in names]
+    words = [cause_in_words(str(name)) for name in names]
     more = len(words) - MOST_ALTERNATIVES
     shown = ", ".join(words[:MOST_ALTERNATIVES])
     return f"{shown} and {more} more" if more > 0 else shown or "–"
