@@ -53,6 +53,7 @@ class CoulombFriction(LinearForceEffect):
 
     id = "coulomb_friction"
     parameters = (Parameter("magnitude", "{port}", 0.0, "dry friction F"),)
+    standard_law = "dry friction"
     law = "−F sign v; at rest up to F"
     equivalence = (DIRECTIONAL_FRICTION,)
     excitation = "reversals"

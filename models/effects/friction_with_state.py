@@ -110,6 +110,7 @@ class LoadDependentFriction(ForceEffect):
     id = "load_dependent_friction"
     parameters = (Parameter("coefficient", "1", 0.0, "friction per load μ"),)
     needs_joint = True
+    needs_only_drive = True
     law = "−μ |τ| sign v"
     excitation = "hold"
     reference = BITTENCOURT_2012

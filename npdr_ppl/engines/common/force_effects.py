@@ -26,6 +26,7 @@ class ForceEffects:
     Attributes:
         effects: Index in ``Tables.effects``, effect and joint of each effect.
         needs_joints: Whether an effect needs a :class:`Joint` before every step.
+        needs_only_drives: Whether no effect needs more of it than its drive.
     """
 
     def __init__(self, simulator: Simulator, joints: tuple[str, ...], time_step: float) -> None:
@@ -34,7 +35,9 @@ class ForceEffects:
             for place, effect in enumerate(simulator.effects)
             if isinstance(effect, ForceEffect)
         ]
-        self.needs_joints = any(effect.needs_joint for _, effect, _ in self.effects)
+        in_need = [effect for _, effect, _ in self.effects if effect.needs_joint]
+        self.needs_joints = bool(in_need)
+        self.needs_only_drives = all(effect.needs_only_drive for effect in in_need)
         self._joints = joints
         self._time_step = time_step
 

@@ -13,8 +13,8 @@ from npdr_ppl.language.effects import ActionEffect, Effect, ForceEffect
 
 __all__ = ["file_assignments", "is_in_file", "why_not"]
 
-FRICTION, LIMIT = "coulomb_friction", "saturation"
-"""Effects that simulations apply themselves, and that a file holds, too."""
+LIMIT = "saturation"
+"""An effect that simulations apply themselves, and that a file holds, too."""
 
 REASONS = {
     "parameter_drift": "it changes a parameter over minutes; the file has the value at the start",
@@ -33,9 +33,6 @@ def is_in_file(simulator: MujocoMechanism, effect: Effect) -> bool:
     if effect.id == LIMIT:
         # The file's limit acts behind all Python, so no other law may act on the command.
         return not any(isinstance(e, ActionEffect) and effect.port in e.channels for e in others)
-    if effect.id == FRICTION:
-        # Laws that need the joint's acceleration get it without dry friction of other effects.
-        return not any(isinstance(e, ForceEffect) and e.needs_joint for e in others)
     return simulator.is_native(effect)
 
 
@@ -71,10 +68,10 @@ def file_assignments(
         values = effect.own_parameters(parameters)
         if has_dry_friction(effect):
             (dof,) = (p.velocity for p in simulator.force_ports if p.port.name == effect.port)
-            own = present(simulator.model, "dof_frictionloss", dof, result)
             # Python sets its bounds while it runs; the file has the solver's settings for them.
-            more = values["magnitude"] if effect in chosen else torch.zeros_like(own)
-            result["dof_frictionloss", dof] = own + more
+            result["dof_frictionloss", dof] = present(
+                simulator.model, "dof_frictionloss", dof, result
+            )
         elif effect.id == LIMIT and effect in chosen:
             actuator = [action.name for action in simulator.actions].index(effect.port)
             channel, limit = simulator.actions[actuator], values["limit"]

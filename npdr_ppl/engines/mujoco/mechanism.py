@@ -303,6 +303,12 @@ class MujocoMechanism(ClosedLoopSimulator):
         ports = [p for p in self.force_ports if p.port.name == effect.port]
         if not isinstance(effect, ForceEffect) or not ports:
             return False
+        if effect.standard_law == "dry friction" and any(
+            isinstance(other, ForceEffect) and other.needs_joint and not other.needs_only_drive
+            for other in self.effects
+        ):
+            # The accelerations that those get are without dry friction of other effects.
+            return False
         return is_native(self.model, ports[0], effect, self.bindings.places)
 
     def prepared(self, step: float, assigned: set[tuple[str, int]]) -> Any:
@@ -324,7 +330,7 @@ class MujocoMechanism(ClosedLoopSimulator):
             dof
             for dof in sorted(dofs)
             if self.model.dof_frictionloss[dof] == 0.0
-            and ("dof_frictionloss", dof) not in assigned
+            and ("dof_frictionloss", dof) not in assigned & self.bindings.places
             and ("dof_solimp", dof * width) not in self.bindings.places
         )
         may_add = bool(crisp) or any(array.endswith("frictionloss") for array, _ in assigned)

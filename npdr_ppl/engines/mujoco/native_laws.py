@@ -1,7 +1,7 @@
 """Laws of effects that MuJoCo has itself, as numbers of its model.
 
-The engine integrates them better than a force that is held for a step: damping implicitly, springs
-at every stage.
+The engine integrates them better than a force that is held for a step, damping implicitly, springs
+at every stage; and all steps of a batch are then one call.
 """
 
 import importlib
@@ -33,6 +33,8 @@ def is_native(
     off = int(model.opt.disableflags)
     if effect.standard_law == "damping":
         return not off & int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    if effect.standard_law == "dry friction":
+        return not off & int(mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS)
     if effect.standard_law != "spring" or off & int(mujoco.mjtDisableBit.mjDSBL_SPRING):
         return False
     # A joint has one spring with one rest position.
@@ -66,6 +68,9 @@ def native_law(
         # Negative damping would drive the joint.
         total = present(model, *key, assignments) + values["damping"]
         return {key: total.clamp_min(0.0)}
+    if effect.standard_law == "dry friction":
+        key = "dof_frictionloss", port.velocity
+        return {key: present(model, *key, assignments) + values["magnitude"]}
     return {
         ("jnt_stiffness", port.joint): values["stiffness"],
         ("qpos_spring", port.position): values["rest"],

@@ -16,6 +16,7 @@ from npdr_ppl.engines.common.integrators import Components
 from npdr_ppl.engines.mujoco.batches import state_view
 from npdr_ppl.engines.mujoco.channels import Component, Reading
 from npdr_ppl.engines.mujoco.damping import fastest_damping
+from npdr_ppl.engines.mujoco.drive_forces import DriveForces, has_direct_drives
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.second_joints import IMMOVABLE
@@ -108,9 +109,11 @@ class MujocoStepper(EffectChain):
         )
         # The bounds of dry friction that the engine reads, and the bounds without effects.
         self._friction: tuple[np.ndarray, np.ndarray] | None = None
-        self._joints = (
-            JointStates(batch, simulator.force_ports) if self.forces.needs_joints else None
-        )
+        self._joints: JointStates | DriveForces | None = None
+        if self.forces.needs_joints:
+            is_light = self.forces.needs_only_drives and has_direct_drives(batch.model)
+            source = DriveForces if is_light else JointStates
+            self._joints = source(batch, simulator.force_ports)
         self.is_lost = torch.zeros(batch.nsim, dtype=torch.bool)
 
     @property
@@ -311,8 +314,9 @@ class MujocoStepper(EffectChain):
         positions, velocities = self.at_joints((), ())
         state = state._replace(positions=positions, velocities=velocities)
         if self._joints is not None:
-            self._apply(state, tables, before_step=True)
-            self._look(ACCELERATION_STAGE)
+            if isinstance(self._joints, JointStates):
+                self._apply(state, tables, before_step=True)
+                self._look(ACCELERATION_STAGE)
             state = self.forces.begin_step(state, self._joints.read(positions, velocities), tables)
         self._apply(state, tables)
         memory = self.forces.next_memory(state, tables)

@@ -19,14 +19,17 @@ class ForceEffect(Effect):
     Attributes:
         needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
             of the accelerations per step.
+        needs_only_drive: Whether that is for the joint's drive alone; engines may then leave its
+            acceleration and inverse inertia NaN, and save the evaluations.
         needs_past: Whether its initial memory needs :attr:`Start.displacements`.
-        standard_law: ``"damping"`` with the parameter ``damping``, or ``"spring"`` with
-            ``stiffness`` and ``rest``, if the law is one that engines have themselves; else empty.
-            A subclass with another law makes it empty.
+        standard_law: ``"damping"`` with the parameter ``damping``, ``"dry friction"`` with
+            ``magnitude``, or ``"spring"`` with ``stiffness`` and ``rest``, if the law is one that
+            engines have themselves; else empty. A subclass with another law makes it empty.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
     needs_joint: ClassVar[bool] = False
+    needs_only_drive: ClassVar[bool] = False
     needs_past: ClassVar[bool] = False
     standard_law: ClassVar[str] = ""
 
