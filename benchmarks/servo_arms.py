@@ -64,11 +64,11 @@ def tasks(
     for seed in seeds:
         for condition in conditions:
             for number, arm in enumerate(arms):
-                turn = seed * len(arms) + number
+                turn = seed + number * (len(kinds) // len(arms))
                 chosen = {"none": (), "one": (kinds[turn % len(kinds)],), "two": tuple(kinds)}
                 # All pairs of kind and separation come up.
-                round_of_kinds = turn // len(kinds)
-                wanted = separations[(turn + round_of_kinds) % len(separations)]
+                round_of_kinds = seed // len(kinds)
+                wanted = separations[(seed + number + round_of_kinds) % len(separations)]
                 if condition == "none":
                     wanted = 0.0
                 yield Task(arm, condition, chosen[condition], wanted, masses, seed)

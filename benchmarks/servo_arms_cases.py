@@ -66,6 +66,7 @@ KINDS: dict[str, Kind] = {
     "bus_delay": Kind("input_delay", "bus", 2e-3, 8e-3),
     "servo_gain": Kind("servo_gain", "servo", 0.05, 0.15, is_signed=True),
     "sensor_offset": Kind("encoder_bias", "sensor", 3e-3, 0.015, is_signed=True),
+    "tool": Kind("offset_payload", "payload", 0.3, 1.0),
     "tilt": Kind("tilt", "gravity", 0.5 * _DEGREE, 2.0 * _DEGREE, numbers=2, is_signed=True),
 }
 """What may be hidden; sizes in N m at a speed of 1 rad/s, kg, s, rad, or relative."""

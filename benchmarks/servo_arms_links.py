@@ -105,6 +105,12 @@ class Arm:
         """Names of the joints."""
         return tuple(link.joint for link in self.links)
 
+    @property
+    def tip(self) -> Array:
+        """Where a tool's mass is in the last link's frame, m: 8 cm ahead of the flange, 5 aside."""
+        ahead = np.array(self.flange)
+        return ahead + 0.08 * ahead / np.linalg.norm(ahead) + np.array([0.05, 0.0, 0.0])
+
     @cached_property
     def public(self) -> Values:
         """The public values."""
@@ -329,6 +335,7 @@ def mjcf(
     time_step: float = TIME_STEP,
     integrator: str = "implicitfast",
     payload: float = 0.0,
+    tool: float = 0.0,
     gravity: Sequence[float] = (0.0, 0.0, -GRAVITY),
     gains: Array | None = None,
 ) -> str:
@@ -340,6 +347,7 @@ def mjcf(
         time_step: Seconds.
         integrator: MuJoCo's name of the integrator.
         payload: Mass at the flange, kg.
+        tool: Mass at the tip of a tool, kg.
         gravity: Gravity in the base's frame, m/s².
         gains: Torque per position error of each servo, N m/rad; the arm's own if not given.
     """
@@ -356,11 +364,12 @@ def mjcf(
             f'diaginertia="{_text(moment * mass / usual for moment in link.inertia)}"/>\n'
         )
         ends += "</body>\n"
-    if payload:
-        bodies += (
-            f'<body name="load" pos="{_text(arm.flange)}">'
-            f'<inertial pos="0 0 0" mass="{payload!r}" diaginertia="1e-9 1e-9 1e-9"/></body>\n'
-        )
+    for name, place, mass in (("load", arm.flange, payload), ("tool", arm.tip.tolist(), tool)):
+        if mass:
+            bodies += (
+                f'<body name="{name}" pos="{_text(place)}">'
+                f'<inertial pos="0 0 0" mass="{mass!r}" diaginertia="1e-9 1e-9 1e-9"/></body>\n'
+            )
     servos = "".join(
         f'<position name="{link.servo}" joint="{link.joint}" kp="{own!r}" '
         f'kv="{link.gains[1]!r}" ctrlrange="-6.28 6.28" '

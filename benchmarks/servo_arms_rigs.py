@@ -105,6 +105,8 @@ def changed(arm: Arm, hidden: Sequence[Hidden]) -> dict[str, Any]:
     for effect in hidden:
         if effect.kind == "payload":
             result["payload"] = effect.size[0]
+        elif effect.kind == "tool":
+            result["tool"] = effect.size[0]
         elif effect.kind == "tilt":
             result["gravity"] = _tilted(*effect.size)
         elif effect.kind == "servo_gain":

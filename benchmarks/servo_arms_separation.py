@@ -214,6 +214,10 @@ def _look_alikes(twin: Twin, effect: Hidden) -> list[tuple[tuple[str, ...], Arra
             ((f"{sensor}.sensor_delay",), late),
             ((f"{sensor}.sensor_low_pass",), filtered),
         ]
+    if effect.kind == "payload":  # one with a place of its own contains it
+        return [(("payload.offset_payload",), twin.change([effect]))]
+    if effect.kind == "tool":
+        return [(("payload.payload",), twin.change([Hidden("payload", None, (size,))]))]
     if effect.kind == "constant_torque":
         here[..., own] = 1.0
         return [((f"{sensor}.encoder_bias",), here)]

@@ -49,7 +49,7 @@ from npdr_ppl.models.effects.servos import (
     ServoForceLimit,
     ServoGain,
 )
-from npdr_ppl.models.effects.surroundings import Contact, Payload, Tilt
+from npdr_ppl.models.effects.surroundings import Contact, OffsetPayload, Payload, Tilt
 from npdr_ppl.models.effects.timing import ClockSkew, SensorDelay
 from npdr_ppl.models.effects.transmission import Backlash, JointElasticity
 
@@ -77,6 +77,7 @@ __all__ = [
     "IntegralAction",
     "JointElasticity",
     "LoadDependentFriction",
+    "OffsetPayload",
     "ParameterDrift",
     "Payload",
     "PeriodicDisturbance",

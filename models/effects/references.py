@@ -3,6 +3,7 @@
 __all__ = [
     "ARMSTRONG_1994",
     "ASTROM_1995",
+    "ATKESON_1986",
     "BITTENCOURT_2012",
     "CANUDAS_1995",
     "DYNAMIXEL",
@@ -20,6 +21,10 @@ ARMSTRONG_1994 = (
 ASTROM_1995 = (
     "K. J. Åström, T. Hägglund, PID controllers: theory, design, and tuning, second edition, "
     "1995, section 3.5"
+)
+ATKESON_1986 = (
+    "C. G. Atkeson, C. H. An, J. M. Hollerbach, Estimation of inertial parameters of manipulator "
+    "loads and links, The International Journal of Robotics Research, 1986"
 )
 CANUDAS_1995 = (
     "C. Canudas de Wit, H. Olsson, K. J. Åström, P. Lischinsky, A new model for control of "

@@ -50,6 +50,7 @@ BUILT_IN = {
     "backlash": f"{_HOME}.transmission:Backlash",
     "base_compliance": f"{_HOME}.carriers:BaseCompliance",
     "payload": f"{_HOME}.surroundings:Payload",
+    "offset_payload": f"{_HOME}.surroundings:OffsetPayload",
     "unbalance": f"{_HOME}.forces:Unbalance",
     "tilt": f"{_HOME}.surroundings:Tilt",
     "encoder_bias": f"{_HOME}.sensing:EncoderBias",

@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.language.channels import Parameter, Port
-from npdr_ppl.language.effects import EnvironmentEffect
+from npdr_ppl.language.effects import EnvironmentEffect, LoadEffect
 from npdr_ppl.models.effects.equivalence import ANGLE_OFFSET, OVERALL_SCALE
-from npdr_ppl.models.effects.references import JANOT_2019, MUJOCO
+from npdr_ppl.models.effects.references import ATKESON_1986, JANOT_2019, MUJOCO
 
-__all__ = ["Contact", "Payload", "Tilt"]
+__all__ = ["Contact", "OffsetPayload", "Payload", "Tilt"]
 
 
 class Tilt(EnvironmentEffect):
@@ -61,8 +61,7 @@ class Tilt(EnvironmentEffect):
 class Payload(EnvironmentEffect):
     """An extra mass Δm at the place of the port, with its inertia and weight.
 
-    In MuJoCo, the place is the centre of mass of the last body. A load elsewhere, as at the tip,
-    then has another mass, and other effects make up for the rest.
+    In MuJoCo, the place is the centre of mass of the last body; see :class:`OffsetPayload`.
     """
 
     id = "payload"
@@ -83,6 +82,45 @@ class Payload(EnvironmentEffect):
     def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
         """Returns the port's mass plus Δm."""
         return value + parameters["mass"]
+
+
+class OffsetPayload(LoadEffect):
+    """An extra point mass Δm at (x, y, z) from the place of the port, as of a tool at the tip.
+
+    In MuJoCo, the place is the centre of mass of the last body, and x, y and z are along the
+    axes of its frame.
+    """
+
+    id = "offset_payload"
+    parameters = (
+        Parameter("mass", "{port}", 0.0, "extra mass Δm"),
+        Parameter("x", "{coordinate}", 0.0, "distance along the body's x axis"),
+        Parameter("y", "{coordinate}", 0.0, "distance along the body's y axis"),
+        Parameter("z", "{coordinate}", 0.0, "distance along the body's z axis"),
+    )
+    strength = ("mass",)
+    contains = ("payload",)
+    law = "m + Δm, with Δm at (x, y, z) from the centre of mass"
+    excitation = "payload"
+    reference = ATKESON_1986
+
+    def default_priors(self, port: Port) -> dict[str, Distribution]:
+        """Mass half-normal, 20 % of the port's rated mass; each distance 10 % of its length."""
+        distance = dist.Normal(0.0, 0.1 * port.rated_position)
+        return {"mass": dist.HalfNormal(0.2 * port.rated), "x": distance, "y": distance,
+                "z": distance}  # fmt: skip
+
+    def suits(self, port: Port) -> bool:
+        """Returns whether the port is the mass of a body that has axes."""
+        return port.unit == "kg" and port.coordinate == "m"
+
+    def environment(self, value: Any, parameters: Mapping[str, Tensor]) -> Any:
+        """Returns the port's mass plus Δm."""
+        return value + parameters["mass"]
+
+    def place(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns (x, y, z)."""
+        return parameters["x"], parameters["y"], parameters["z"]
 
 
 class Contact(EnvironmentEffect):

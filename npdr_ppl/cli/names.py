@@ -89,6 +89,7 @@ EFFECTS = (
     "backlash",
     "base_compliance",
     "payload",
+    "offset_payload",
     "unbalance",
     "tilt",
     "encoder_bias",

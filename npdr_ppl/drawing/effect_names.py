@@ -39,6 +39,7 @@ TITLES = {
     "input_delay": "{where} delay",
     "joint_elasticity": "elastic transmission at {joint}",
     "load_dependent_friction": "load-dependent friction at {joint}",
+    "offset_payload": "additional payload off the centre of mass",
     "parameter_drift": "drift of {where}",
     "payload": "additional payload",
     "periodic_disturbance": "periodic force at {joint}",

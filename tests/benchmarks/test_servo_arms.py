@@ -86,8 +86,8 @@ def test_gravity_turns_as_in_the_catalogue():
 
 
 def test_tasks_take_all_kinds_in_turn():
-    found = list(tasks(["one", "none"], list(ARMS), list(KINDS), [0.0, 30.0], "known", range(11)))
-    assert len(found) == 44
+    found = list(tasks(["one", "none"], list(ARMS), list(KINDS), [0.0, 30.0], "known", range(12)))
+    assert len(found) == 48
     for arm in ARMS:
         own = [task for task in found if task.arm == arm and task.condition == "one"]
         assert {task.kinds[0] for task in own} == set(KINDS)

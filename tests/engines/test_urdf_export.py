@@ -9,7 +9,13 @@ from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.engines.mujoco.base_parameters import load_mjcf
 from npdr_ppl.engines.mujoco.urdf_export import export_urdf
 from npdr_ppl.errors import ModelError
-from npdr_ppl.models.effects import CoulombFriction, Payload, StribeckFriction, ViscousFriction
+from npdr_ppl.models.effects import (
+    CoulombFriction,
+    OffsetPayload,
+    Payload,
+    StribeckFriction,
+    ViscousFriction,
+)
 from tests.helpers.mujoco_files import ARM, random_inputs, value
 
 ROBOT = """<?xml version="1.0"?>
@@ -59,9 +65,16 @@ def arm(folder, *names, tool=""):
     return MujocoSimulator(path, {name: FIELDS[name] for name in names})
 
 
-def test_a_urdf_file_moves_as_the_fitted_model(tmp_path):
+@pytest.mark.parametrize(
+    ("payload", "values"),
+    [
+        (Payload("payload"), {"mass": 0.2}),
+        (OffsetPayload("payload"), {"mass": 0.2, "y": 0.1, "z": -0.05}),
+    ],
+)
+def test_a_urdf_file_moves_as_the_fitted_model(tmp_path, payload, values):
     simulator = arm(tmp_path, "upper", "centre", "damping", "friction").with_effects(
-        ViscousFriction("elbow_torque"), Payload("payload")
+        ViscousFriction("elbow_torque"), payload
     )
     numbers = {
         "upper": 1.1,
@@ -69,8 +82,8 @@ def test_a_urdf_file_moves_as_the_fitted_model(tmp_path):
         "damping": 0.25,
         "friction": 0.02,
         "elbow_torque.viscous_friction.damping": 0.07,
-        "payload.payload.mass": 0.2,
     }
+    numbers |= {f"{payload.name}.{name}": number for name, number in values.items()}
     given = {name: value(number) for name, number in numbers.items()}
     found = export_urdf(simulator, given)
     assert not found.refused and "<!-- kept -->" in found.text

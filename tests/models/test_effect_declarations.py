@@ -30,7 +30,7 @@ from npdr_ppl.models.furuta import Furuta
 
 def test_the_catalogue_has_all_effects_with_what_discovery_needs():
     catalogue = effects()
-    assert len(catalogue) == 41
+    assert len(catalogue) == 42
     for name, effect in catalogue.items():
         assert effect.id == name
         assert effect.law and effect.reference

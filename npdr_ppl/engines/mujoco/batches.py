@@ -11,7 +11,14 @@ import numpy as np
 from npdr_ppl.engines.mujoco.parameters import Assignments
 from npdr_ppl.errors import ModelError
 
-__all__ = ["has_constraints", "make_batch", "prepared_copy", "quiet", "state_view"]
+__all__ = [
+    "can_move_centre",
+    "has_constraints",
+    "make_batch",
+    "prepared_copy",
+    "quiet",
+    "state_view",
+]
 
 # MuJoCo's friction is soft: it reduces a joint's speed over the time constant of ``solref`` and
 # lets a stuck joint creep. These values are the hardest allowed: the greatest impedance, and a
@@ -85,17 +92,26 @@ def _with_free_frames(model: Any, bodies: set[int]) -> Any:
         return model
     changed = copy.copy(model)
     for body in fixed:
+        if not can_move_centre(model, body):
+            raise ModelError(
+                f"The centre of mass of body {model.body(body).name!r} cannot be changed, because "
+                "it is at the joints' origin in the file; move it there by 1e-6 m."
+            )
         changed.body_sameframe[body] = 0
         if model.body_simple[body]:
-            first, num = model.body_dofadr[body], model.body_dofnum[body]
-            if num > 1:
-                raise ModelError(
-                    f"The centre of mass of body {model.body(body).name!r} cannot be changed, "
-                    "because it is at the joints' origin in the file; move it there by 1e-6 m."
-                )
             changed.body_simple[body] = 0
-            changed.dof_simplenum[: first + num] = 0
+            changed.dof_simplenum[: model.body_dofadr[body] + model.body_dofnum[body]] = 0
     return changed
+
+
+def can_move_centre(model: Any, body: int) -> bool:
+    """Returns whether simulations can move the centre of mass of a body.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        body: Number of the body.
+    """
+    return not model.body_simple[body] or int(model.body_dofnum[body]) <= 1
 
 
 def state_view(batch: Any, name: str) -> Any:

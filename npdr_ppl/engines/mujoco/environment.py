@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,10 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npdr_ppl.engines.mujoco.added_mass import with_point_mass
+from npdr_ppl.engines.mujoco.batches import can_move_centre
 from npdr_ppl.engines.mujoco.fields import element_names
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.language.channels import Port
-from npdr_ppl.language.effects import Effect, EnvironmentEffect
+from npdr_ppl.language.effects import Effect, EnvironmentEffect, LoadEffect
 
 __all__ = ["EnvironmentPort", "environment_ports", "with_environment"]
 
@@ -43,8 +46,10 @@ def environment_ports(
 ) -> tuple[EnvironmentPort, ...]:
     """Returns gravity, a payload on every last link and floating base, and contact.
 
-    A port exists only if the file has such a quantity. A payload is at the centre of mass of its
-    body. Its port is called ``payload``, or ``<body>.payload`` if there are several.
+    A port exists only if the file has such a quantity. The place of a payload's port is the centre
+    of mass of its body. The port is called ``payload``, or ``<body>.payload`` if there are several.
+    It is rated by the mass of all moving bodies from the base to it, and by their length if the
+    centre of mass can be moved.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -59,8 +64,11 @@ def environment_ports(
     for body in bodies:
         is_alone = len(bodies) == 1 and "payload" not in taken
         name = "payload" if is_alone else f"{names[body]}.payload"
-        mass = float(model.body_mass[body]) or float(model.body_subtreemass[body]) or 1.0
-        ports.append(EnvironmentPort(Port(name, "environment", "kg", mass), body))
+        mass, length = _chain(model, body)
+        port = Port(name, "environment", "kg", mass)
+        if can_move_centre(model, body):
+            port = replace(port, rated_position=length, coordinate="m")
+        ports.append(EnvironmentPort(port, body))
     if _has_contacts(model):
         ports.append(EnvironmentPort(Port("contact", "environment", "1")))
     return tuple(ports)
@@ -91,7 +99,12 @@ def with_environment(
         port = by_name[effect.port]
         if port.body is not None:
             mass = present(model, "body_mass", port.body, result)
-            result["body_mass", port.body] = effect.environment(mass, values)
+            total = effect.environment(mass, values)
+            if isinstance(effect, LoadEffect):
+                place = effect.place(values)
+                result = with_point_mass(model, port.body, total - mass, place, result)
+            else:
+                result["body_mass", port.body] = total
         elif port.port.name == "gravity":
             gravity = tuple(present(model, "opt.gravity", i, result) for i in range(3))
             changed = effect.environment(gravity, values)
@@ -124,6 +137,22 @@ def _loaded_bodies(model: Any, driven: NDArray[np.bool_]) -> list[int]:
         and not driven[np.asarray(model.dof_bodyid) == body].any()
     }
     return [body for body in moving if body not in carriers or body in floating]
+
+
+def _chain(model: Any, last: int) -> tuple[float, float]:
+    """Returns the mass in kg of the moving bodies from the base to the last one, and their length.
+
+    The length in m leads from joint to joint and to the last body's centre of mass.
+    """
+    body, bodies = last, list[int]()
+    while body and model.body_weldid[body]:
+        bodies.append(body)
+        body = int(model.body_parentid[body])
+    mass = sum(float(model.body_mass[b]) for b in bodies) or float(model.body_subtreemass[last])
+    # How far the first body is from the world's origin does not matter.
+    offsets = [np.linalg.norm(model.body_pos[b]) for b in bodies[:-1]]
+    length = float(sum(offsets) + np.linalg.norm(model.body_ipos[last]))
+    return mass or 1.0, length or float(model.stat.extent)
 
 
 def _has_contacts(model: Any) -> bool:

@@ -289,6 +289,7 @@ _WRITERS: dict[str, Callable[[Edits, int], None]] = {
     "body_mass": Edits.inertial,
     "body_inertia": Edits.inertial,
     "body_ipos": Edits.inertial,
+    "body_iquat": Edits.inertial,
     "body_pos": _of("body", "body_pos", "pos"),
     "body_gravcomp": _of("body", "body_gravcomp", "gravcomp"),
     "geom_friction": _of("geom", "geom_friction", "friction"),

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 _DYNAMICS = {"dof_damping": "damping", "dof_frictionloss": "friction"}
 """Attributes of <dynamics> by MuJoCo's arrays."""
 
-_INERTIAL = {"body_mass", "body_inertia", "body_ipos"}
+_INERTIAL = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
 
 _ENTRIES = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2),
             "iyz": (1, 2)}  # fmt: skip
@@ -151,7 +151,8 @@ def _write_inertial(edits: MjcfText, old: Any, new: Any, body: int) -> None:
     if not notes:
         return
     edits.set(mass, {"value": repr(float(new.body_mass[body]))}, f"npdr: {', '.join(notes)}")
-    if not np.array_equal(old.body_inertia[body], new.body_inertia[body]):
+    turned = not np.array_equal(old.body_iquat[body], new.body_iquat[body])
+    if turned or not np.array_equal(old.body_inertia[body], new.body_inertia[body]):
         edits.set(inertia, {name: repr(float(matrix[at])) for name, at in _ENTRIES.items()})
     if not np.array_equal(old.body_ipos[body], new.body_ipos[body]):
         centre = " ".join(repr(float(x)) for x in new.body_ipos[body])

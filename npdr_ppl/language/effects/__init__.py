@@ -11,7 +11,11 @@ has), then ``force.py``.
 from npdr_ppl.language.effects.action import ActionEffect, Commands, Uneven
 from npdr_ppl.language.effects.compliance import Carrier, ComplianceEffect
 from npdr_ppl.language.effects.effect import Effect, upper_end
-from npdr_ppl.language.effects.environment import EnvironmentEffect, ParameterEffect
+from npdr_ppl.language.effects.environment import (
+    EnvironmentEffect,
+    LoadEffect,
+    ParameterEffect,
+)
 from npdr_ppl.language.effects.force import ForceEffect, LinearForceEffect
 from npdr_ppl.language.effects.sensor import BentSensorEffect, SensorEffect
 from npdr_ppl.language.effects.servo import ServoEffect
@@ -26,6 +30,7 @@ __all__ = [
     "EnvironmentEffect",
     "ForceEffect",
     "LinearForceEffect",
+    "LoadEffect",
     "ParameterEffect",
     "SensorEffect",
     "ServoEffect",

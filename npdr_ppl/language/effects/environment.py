@@ -9,7 +9,7 @@ from torch import Tensor
 from npdr_ppl.language.channels import PortKind
 from npdr_ppl.language.effects.effect import Effect
 
-__all__ = ["EnvironmentEffect", "ParameterEffect"]
+__all__ = ["EnvironmentEffect", "LoadEffect", "ParameterEffect"]
 
 
 class EnvironmentEffect(Effect):
@@ -24,6 +24,17 @@ class EnvironmentEffect(Effect):
         Examples are the gravity vector (x, y, z) in m/s², and the
         :class:`~npdr_ppl.language.effect_context.Servo` at a servo's port.
         """
+
+
+class LoadEffect(EnvironmentEffect):
+    """A point mass at a port that is the mass of a body, at a place of its own.
+
+    :meth:`environment` returns the mass together with the body's.
+    """
+
+    @abstractmethod
+    def place(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns its place (x, y, z) from the body's centre of mass along the body's axes, in m."""
 
 
 class ParameterEffect(Effect):

@@ -1,0 +1,101 @@
+"""A point mass that is fixed to a body: the numbers of a model that it changes."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.engines.mujoco.parameters import Assignments, present
+
+__all__ = ["with_point_mass"]
+
+
+def with_point_mass(
+    model: Any,
+    body: int,
+    added: Tensor,
+    place: tuple[Tensor, Tensor, Tensor],
+    assignments: Assignments,
+) -> Assignments:
+    """Returns the mass, centre and inertia of a body together with a point mass.
+
+    The centre moves by d Δm/(m + Δm), and the inertia about it grows by μ (|d|² 1 − d dᵀ) with the
+    reduced mass μ = m Δm/(m + Δm). Without an added mass, or at the centre, the numbers that it
+    would not change are exactly the present ones.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        body: Number of the body, of mass m.
+        added: The mass Δm in kg, a number or ``(N,)``.
+        place: Its place d from the body's centre of mass along the body's axes, in m, likewise.
+        assignments: Values to write into the model without it.
+    """
+
+    def numbers(array: str, count: int) -> Tensor:
+        """Returns a row of an array, ``(..., count)``."""
+        row = [present(model, array, count * body + i, assignments) for i in range(count)]
+        return torch.stack(torch.broadcast_tensors(*row), dim=-1)
+
+    mass = present(model, "body_mass", body, assignments)
+    total = mass + added
+    distance = torch.stack(torch.broadcast_tensors(*place), dim=-1)
+    centre, inertia = numbers("body_ipos", 3), numbers("body_inertia", 3)
+    turn = numbers("body_iquat", 4)
+    moved = centre + (added / total)[..., None] * distance
+    axes = _rotation(turn)
+    along = (axes.mT @ distance[..., None])[..., 0]
+    square = (along * along).sum(-1)[..., None, None] * torch.eye(3, dtype=torch.float64)
+    reduced = (mass * added / total)[..., None, None]
+    more = reduced * (square - along[..., None] * along[..., None, :])
+    values, vectors = torch.linalg.eigh(torch.diag_embed(inertia) + more)
+    vectors = vectors * torch.linalg.det(vectors).sign()[..., None, None]
+    is_same = (more == 0.0).all(-1).all(-1)[..., None]
+    inertia = torch.where(is_same, inertia, values)
+    turn = torch.where(is_same, turn, _quaternion(axes @ vectors))
+    result = dict(assignments)
+    result["body_mass", body] = total
+    rows = (("body_ipos", moved), ("body_inertia", inertia), ("body_iquat", turn))
+    for array, row in rows:
+        count = row.shape[-1]
+        result |= {(array, count * body + i): row[..., i].contiguous() for i in range(count)}
+    return result
+
+
+def _rotation(quaternion: Tensor) -> Tensor:
+    """Returns rotation matrices, ``(..., 3, 3)``, of unit quaternions, ``(..., 4)``."""
+    w, x, y, z = quaternion.unbind(-1)
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """Returns unit quaternions of rotation matrices.
+
+    Each row of 4 q qᵀ is the quaternion times a number; the longest row is the most exact.
+    """
+    r = rotation
+    xx, yy, zz = (r[..., i, i] for i in range(3))
+    wx, wy, wz = (
+        r[..., 2, 1] - r[..., 1, 2],
+        r[..., 0, 2] - r[..., 2, 0],
+        r[..., 1, 0] - r[..., 0, 1],
+    )
+    xy, xz, yz = (
+        r[..., 0, 1] + r[..., 1, 0],
+        r[..., 0, 2] + r[..., 2, 0],
+        r[..., 1, 2] + r[..., 2, 1],
+    )
+    rows = (
+        (1.0 + xx + yy + zz, wx, wy, wz),
+        (wx, 1.0 + xx - yy - zz, xy, xz),
+        (wy, xy, 1.0 - xx + yy - zz, yz),
+        (wz, xz, yz, 1.0 - xx - yy + zz),
+    )
+    squares = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    longest = squares.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    chosen = torch.take_along_dim(squares, longest[..., None, None], dim=-2)[..., 0, :]
+    return chosen / chosen.norm(dim=-1, keepdim=True)
