@@ -107,7 +107,7 @@ class Arm:
 
     @property
     def tip(self) -> Array:
-        """Where a tool's mass is in the last link's frame, m: 8 cm ahead of the flange, 5 aside."""
+        """Place of a tool's mass in the last link's frame, m: 8 cm beyond the flange, 5 aside."""
         ahead = np.array(self.flange)
         return ahead + 0.08 * ahead / np.linalg.norm(ahead) + np.array([0.05, 0.0, 0.0])
 

@@ -208,11 +208,12 @@ class GapRecord(TypedDict, total=False):
 
 
 class CauseEffectRecord(TypedDict):
-    """An effect of a cause."""
+    """An effect of a cause, with the priors that differ from the effect's own."""
 
     effect: str
     port: str
     constants: dict[str, float]
+    priors: NotRequired[dict[str, dict[str, Any] | None]]
 
 
 class CauseRecord(TypedDict):

@@ -4,8 +4,6 @@ import inspect
 from collections.abc import Mapping
 from pathlib import Path
 
-import pyro.distributions
-from torch import Tensor
 from torch.distributions import Distribution
 
 from npdr_ppl.excerpts import import_lines
@@ -15,6 +13,7 @@ from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps, nu
 from npdr_ppl.language.layers import layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors, wider_sites
+from npdr_ppl.language.written_priors import written_prior
 from npdr_ppl.python_files import is_importable
 from npdr_ppl.python_text import plain, quoted
 
@@ -113,17 +112,12 @@ def _added(effect: Effect, names: Mapping[type[Effect], str]) -> list[str]:
 
 def _distribution(prior: Distribution) -> str | None:
     """Returns a Pyro distribution as source, or ``None`` if it cannot be written so."""
-    name = type(prior).__name__
-    if getattr(pyro.distributions, name, None) is not type(prior):
+    written = written_prior(prior)
+    if written is None:
         return None
-    given = []
-    for word in inspect.signature(type(prior)).parameters:
-        value = getattr(prior, word, None)
-        if isinstance(value, Tensor) and value.ndim == 0:
-            given.append(f"{word}={value.item()!r}")
-        elif word != "validate_args":
-            return None
-    return f"pyro.distributions.{name}({', '.join(given)})"
+    name, *arguments = written.items()
+    given = ", ".join(f"{word}={value!r}" for word, value in arguments)
+    return f"pyro.distributions.{name[1]}({given})"
 
 
 def _base(model: Model) -> tuple[str, str, Path | None]:

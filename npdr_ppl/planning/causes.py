@@ -24,6 +24,7 @@ from npdr_ppl.language.only_simulator import only_simulator
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.simulator import Simulator
 from npdr_ppl.language.wider_priors import with_wider_priors
+from npdr_ppl.language.written_priors import read_prior
 from npdr_ppl.models.effects import effect_class
 from npdr_ppl.planning.settings import PLANNING
 from npdr_ppl.posterior.robot_file import identified
@@ -334,7 +335,9 @@ def _effect(described: Mapping[str, Any], run: Path, laws: Mapping[str, str]) ->
             f"{run} learned the law {laws[name]}, but the added effect {name!r} has another, "
             f"{cls.law}; give `npdr effects --remove {name}` and `npdr effects --add {file}`."
         )
-    effect = cls(described["port"])
+    written = described.get("priors", {}).items()
+    priors = {n: read_prior(prior) for n, prior in written if prior is not None}
+    effect = cls(described["port"], priors=priors)
     constants = dict(described["constants"])
     if constants != effect.constants and effect.has_ripples:
         effect = effect.with_ripples(int(constants["order"]))

@@ -41,8 +41,8 @@ from tests.helpers.exported_robots import (
 from tests.helpers.mujoco_files import ROLLING
 
 IN_FILE = {
-    "viscous_friction", "coulomb_friction", "spring", "payload", "offset_payload", "tilt", "contact",
-    "saturation", "servo_gain", "servo_force_limit", "base_compliance",
+    "viscous_friction", "coulomb_friction", "spring", "payload", "offset_payload", "tilt",
+    "contact", "saturation", "servo_gain", "servo_force_limit", "base_compliance",
 }  # fmt: skip
 REFUSED = {"parameter_drift"}
 

@@ -94,6 +94,16 @@ def test_another_time_step_keeps_the_parameters_and_how_well_they_are_known(dela
     assert at_time_step(known, 0.02) is known
 
 
+def test_the_prior_of_an_effect_is_that_of_the_search(delayed):
+    found = json.loads((delayed / "discovery.json").read_text())
+    prior = {"distribution": "Uniform", "low": 0.0, "high": 0.4}
+    (effect,) = found["surviving_causes"]["causes"][0]["effects"]
+    effect["priors"] = {"delay": prior}
+    (delayed / "discovery.json").write_text(json.dumps(found))
+    found = parameters(causes_of_run(delayed, pendulum))
+    assert found["angle,velocity.sensor_delay.delay"] == pytest.approx(0.2)
+
+
 def test_a_delay_longer_than_the_prior_at_another_time_step_gets_a_sentence(delayed):
     found = json.loads((delayed / "discovery.json").read_text())
     found["surviving_causes"]["causes"][0]["coordinates"] = [0.0, 0.0, 0.5]  # 41 ms

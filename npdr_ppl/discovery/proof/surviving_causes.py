@@ -17,6 +17,7 @@ from npdr_ppl.discovery.proof.settings import EXPERIMENT
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.discovery.search.rounds import Search
+from npdr_ppl.language.written_priors import written_prior
 from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["VERSION", "SurvivingCauses", "ranges", "surviving_causes"]
@@ -125,7 +126,13 @@ def _described(hypothesis: Hypothesis, probability: float) -> dict[str, Any]:
     precision = information + torch.eye(len(information), dtype=torch.float64)
     return {
         "effects": [
-            {"effect": effect.id, "port": effect.port, "constants": effect.constants}
+            {
+                "effect": effect.id,
+                "port": effect.port,
+                "constants": effect.constants,
+                # Those that differ from the effect's own, which the coordinates refer to.
+                "priors": {n: written_prior(p) for n, p in effect.given_priors.items()},
+            }
             for effect in hypothesis.effects
         ],
         "probability": None if math.isnan(probability) else probability,

@@ -9,7 +9,7 @@ from npdr_ppl.engines.mujoco.callbacks.python_file import has_dry_friction, law_
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.effects import ActionEffect, Effect, ForceEffect
+from npdr_ppl.language.effects import ActionEffect, Effect
 
 __all__ = ["file_assignments", "is_in_file", "why_not"]
 

@@ -46,10 +46,10 @@ def environment_ports(
 ) -> tuple[EnvironmentPort, ...]:
     """Returns gravity, a payload on every last link and floating base, and contact.
 
-    A port exists only if the file has such a quantity. The place of a payload's port is the centre
-    of mass of its body. The port is called ``payload``, or ``<body>.payload`` if there are several.
-    It is rated by the mass of all moving bodies from the base to it, and by their length if the
-    centre of mass can be moved.
+    A port exists only if the file has such a quantity. A payload's place is the centre of mass of
+    its body. Its port is called ``payload``, or ``<body>.payload`` if there are several. It is
+    rated by the mass of all moving bodies from the base to it, and by their length if the centre
+    of mass can be moved.
 
     Args:
         model: A ``mujoco.MjModel``.

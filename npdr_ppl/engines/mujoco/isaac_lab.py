@@ -101,10 +101,7 @@ def isaac_lab_file(
                 terms[f"body_{body}_material"] = _material(model, body, columns)
         elif array == "gravity":
             terms["gravity"] = _gravity(model, columns)
-        elif (
-            array in ("body_inertia", "body_iquat")
-            and ("body_mass", kind, name, 0) in columns
-        ):
+        elif array in ("body_inertia", "body_iquat") and ("body_mass", kind, name, 0) in columns:
             continue  # it follows the mass
         elif array not in _GAINS:
             refused[f"{array} of {name}" if name else array] = "Isaac Lab has no event for it"

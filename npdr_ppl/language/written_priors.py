@@ -1,0 +1,52 @@
+"""Priors of single numbers as a name and arguments, so that files can keep them."""
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import pyro.distributions
+from torch import Tensor
+from torch.distributions import Distribution
+
+from npdr_ppl.errors import DataError
+
+__all__ = ["read_prior", "written_prior"]
+
+_NAME = "distribution"
+
+
+def written_prior(prior: Distribution) -> dict[str, Any] | None:
+    """Returns a prior's name in Pyro, under ``"distribution"``, and its arguments.
+
+    ``None`` if it is none of Pyro's own distributions, or not of one number with numbers as
+    arguments.
+    """
+    name = type(prior).__name__
+    if getattr(pyro.distributions, name, None) is not type(prior):
+        return None
+    written: dict[str, Any] = {_NAME: name}
+    for word in inspect.signature(type(prior)).parameters:
+        value = getattr(prior, word, None)
+        if isinstance(value, Tensor) and value.ndim == 0:
+            written[word] = value.item()
+        elif word != "validate_args":
+            return None
+    return written
+
+
+def read_prior(written: Mapping[str, Any]) -> Distribution:
+    """Returns the prior that :func:`written_prior` wrote.
+
+    Raises:
+        DataError: It is no such prior.
+    """
+    arguments = {word: value for word, value in written.items() if word != _NAME}
+    cls = getattr(pyro.distributions, str(written.get(_NAME)), None)
+    try:
+        if not (inspect.isclass(cls) and issubclass(cls, Distribution)):
+            raise ValueError(f"no distribution {written.get(_NAME)!r}")
+        numbers = {word: float(value) for word, value in arguments.items()}
+        prior: Distribution = cls(**numbers, validate_args=True)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{dict(written)} is no prior of one number: {error}") from error
+    return prior
