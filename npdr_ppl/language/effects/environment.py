@@ -34,7 +34,7 @@ class LoadEffect(EnvironmentEffect):
 
     @abstractmethod
     def place(self, parameters: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns its place (x, y, z) in m from the body's centre of mass, along the body's axes."""
+        """Returns its place (x, y, z) in m from the body's centre of mass, along its axes."""
 
 
 class ParameterEffect(Effect):
