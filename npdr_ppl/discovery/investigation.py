@@ -242,7 +242,7 @@ class Investigation:
         with self.progress.timed("limits"):
             for added in search.added:
                 names = list(final.at_edge(added.effect))
-                if added.share > VERDICT.minor_share * explains:
+                if added.share > VERDICT.minor_share * explains and not search.has_stopped:
                     step = self.progress.stage(f"vary the shape of {added.effect.name}")
                     names += limits(final, added.effect, self._searcher.trials, step)
                 result.append(tuple(dict.fromkeys(names)))

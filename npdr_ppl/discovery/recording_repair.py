@@ -229,6 +229,9 @@ def _trusted_remedy(
     best, least = _best(remedies(sensors, rollouts, suspects, singly=singly), ratio, report)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
+    if best is not None and _is_early(best) and trials.ratio_with_lag() <= least:
+        # It is the device that answers late: what follows is for discovery to name.
+        return None
     if best is not None and least < REPAIR.remedy_factor:
         without = trials.ratio_without(best)
     else:
@@ -241,6 +244,12 @@ def _trusted_remedy(
         return best
     # What a remedy does not explain, either, may be a matter of priors that are too narrow.
     return best if least < REPAIR.remedy_factor * trials.ratio_with_wider_priors(as_read) else None
+
+
+def _is_early(remedy: Remedy) -> bool:
+    """Returns whether a remedy takes time stamps of commands for early ones."""
+    shift = remedy.apply
+    return isinstance(shift, Shift) and shift.channel is None and shift.steps < 0.0
 
 
 def _best(

@@ -7,13 +7,17 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
+from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model, with_effects
 from npdr_ppl.discovery.remedies import Remedy, Shift
 from npdr_ppl.discovery.screening.encoder_resolution import count_of
 from npdr_ppl.discovery.search.prior_ends import with_widest_priors
 from npdr_ppl.discovery.settings import REPAIR
 from npdr_ppl.errors import DataError, NpdrError
+from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.model import Model
+from npdr_ppl.language.only_simulator import only_simulator
+from npdr_ppl.models.effects import ActuatorLag
+from npdr_ppl.models.effects.candidates import attached
 from npdr_ppl.preparation.data_options import DataOptions, one_of_each_part
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
@@ -148,6 +152,21 @@ class RemedyTrials:
         start = self._parameters[remedy.sentence]
         again = self._windows.fitted(self._model, self._rollouts, start)
         return 1.0 if again is None else min(1.0, relative_misfit(misfits_of(again), self.present))
+
+    def ratio_with_lag(self) -> float:
+        """Returns the relative misfit of the recording as it was read, if commands are lagged.
+
+        A motor's first-order lag looks like time stamps of commands that are early.
+        """
+        simulator = only_simulator(self._model)[0].simulator
+        widest: dict[str, Effect] = {}
+        for lag in attached(simulator, ActuatorLag):
+            kind = simulator.port(lag.port).kind
+            if kind not in widest or len(lag.channels) > len(widest[kind].channels):
+                widest[kind] = lag
+        model = with_effects(self._model, tuple(widest.values()))
+        tried = self._windows.fitted(model, self._rollouts, self._as_read) if widest else None
+        return math.inf if tried is None else relative_misfit(misfits_of(tried), self.present)
 
     def ratio_with_wider_priors(self, as_read: Hypothesis) -> float:
         """Returns the relative misfit of the recording as it was read, with wider priors.

@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import math
+import pickle
 import sys
 
 import numpy as np
@@ -276,6 +277,8 @@ def test_results_do_not_depend_on_what_ran_before():
         ({"parameters": {"mass": Parameter("m", "kg", 1.0)}}, "'m' is given as 'mass'"),
         ({"set_state": None}, "give set_state"),
         ({"sensors": (ANGLE,), "read": "state"}, r"1 sensors.*shape \(2,\)"),
+        ({"read": lambda observation: observation}, "read is .* environment and an observation"),
+        ({"set_state": lambda state: None}, "set_state is .* environment and a state"),
         ({"actions": (ANGLE, VELOCITY)}, "1 actions, but 2 were named"),
         ({"rated": {"force": 1.0}}, "force names no channel"),
         ({"actions": (Channel("angle", "N m"),)}, "angle names two channels"),
@@ -284,6 +287,17 @@ def test_results_do_not_depend_on_what_ran_before():
 def test_mistakes_are_one_sentence(changed, words):
     with pytest.raises(ModelError, match=words):
         pendulum(**changed)
+
+
+def test_an_id_that_only_one_process_knows_is_made_by_others():
+    """Own environments are registered by the file that the main process imports."""
+    gymnasium.register("OwnPendulum-v0", "gymnasium.envs.classic_control.pendulum:PendulumEnv")
+    own = npdr.GymnasiumSimulator("OwnPendulum-v0")
+    sent = pickle.dumps(own)
+    del gymnasium.registry["OwnPendulum-v0"]
+    again = pickle.loads(sent)
+    given = inputs(again, np.ones(5), [])
+    assert torch.equal(own.simulate({}, given), again.simulate({}, given))
 
 
 def test_what_environments_cannot_do_is_said():

@@ -26,11 +26,12 @@ def load_gymnasium() -> Any:
         ) from error
 
 
-def make_environment(name: str, *, is_checked: bool = True) -> Any:
+def make_environment(name: str, specification: Any = None, *, is_checked: bool = True) -> Any:
     """Returns a new environment.
 
     Args:
         name: Its id, e.g. ``"Pendulum-v1"``.
+        specification: Its ``EnvSpec``, with which it is made also where its id is not registered.
         is_checked: Whether Gymnasium checks that the environment's steps follow its interface.
 
     Raises:
@@ -38,7 +39,7 @@ def make_environment(name: str, *, is_checked: bool = True) -> Any:
     """
     gymnasium = load_gymnasium()
     try:
-        return gymnasium.make(name, disable_env_checker=not is_checked)
+        return gymnasium.make(specification or name, disable_env_checker=not is_checked)
     except (gymnasium.error.Error, ImportError) as error:
         raise ModelError(f"Gymnasium cannot make {name!r}: {error}") from error
 

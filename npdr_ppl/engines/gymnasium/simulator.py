@@ -1,5 +1,6 @@
 """Any Gymnasium environment as a simulator."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -29,6 +30,15 @@ _SEEDS = 2**31
 
 # Time steps with a smaller relative difference count as equal: time stamps are rounded.
 _SAME_STEP = 1e-6
+
+
+_TAKES = {
+    "set_parameters": "the values of parameters by name",
+    "set_state": "a state",
+    "read": "an observation",
+    "act": "commands",
+}
+"""The second argument of each function that a user gives."""
 
 
 class GymnasiumSimulator(SteppedSimulator):
@@ -101,6 +111,14 @@ class GymnasiumSimulator(SteppedSimulator):
                 "Workers make their environments themselves: give an id or a function that makes "
                 f"one, not {environment!r}."
             )
+        given = {
+            "set_parameters": set_parameters,
+            "set_state": set_state,
+            "read": read,
+            "act": act,
+        }
+        for name, function in given.items():
+            _check_function(name, function)
         self._make = environment
         self.is_deterministic = is_deterministic
         self.states = tuple(states)
@@ -111,7 +129,11 @@ class GymnasiumSimulator(SteppedSimulator):
         if read is None and sensors is None and isinstance(set_state, str):
             read = set_state
         self._read = read
+        # An environment of the user is registered where its file was imported, not on workers.
+        self._specification: Any = None
         made = self.set_up()
+        if isinstance(environment, str):
+            self._specification = made.spec
         try:
             made.reset(seed=0)  # some attributes exist only after a reset
             self._declare(made, parameters or {}, sensors, actions, time_step)
@@ -155,7 +177,7 @@ class GymnasiumSimulator(SteppedSimulator):
         # Steps after the end of an episode are intended here, so no warning is needed.
         load_gymnasium().logger.min_level = load_gymnasium().logger.ERROR
         if isinstance(self._make, str):
-            return make_environment(self._make, is_checked=False)
+            return make_environment(self._make, self._specification, is_checked=False)
         return self._make()
 
     def begin(
@@ -250,7 +272,7 @@ class GymnasiumSimulator(SteppedSimulator):
         if found != (len(self.sensors),):
             raise ModelError(
                 f"{self.name} has {len(self.sensors)} sensors, but reading {inner} gave an array "
-                f"of shape {found}."
+                f"of shape {found}: give read, or sensors that name what is read."
             )
 
     def _check_step(self, time_step: float, error: type[DataError] | type[ModelError]) -> None:
@@ -259,6 +281,18 @@ class GymnasiumSimulator(SteppedSimulator):
                 f"{self.name} makes steps of {self.time_step:g} s, but {time_step:g} s were asked "
                 "for; resample the data, or make an environment with that step."
             )
+
+
+def _check_function(name: str, function: object) -> None:
+    """Raises a ModelError if an argument is a function that cannot be called as it will be."""
+    if not callable(function):
+        return
+    try:
+        inspect.signature(function).bind(None, None)
+    except ValueError:  # it has no signature
+        return
+    except TypeError as error:
+        raise ModelError(f"{name} is a function of the environment and {_TAKES[name]}.") from error
 
 
 class _Simulation:

@@ -199,7 +199,9 @@ def _task_and_payloads(
     """Splits a call into data that all simulations share and data of each simulation."""
     inner = {name for effect in simulator.inner_effects for name in effect.parameter_names}
     names = tuple(p.name for p in simulator.parameters) + tuple(sorted(inner))
-    matrix = torch.stack([domain[name].expand(shape).reshape(-1) for name in names], dim=-1)
+    matrix = torch.zeros(shape.numel(), len(names), dtype=torch.float64)
+    for column, name in enumerate(names):
+        matrix[:, column] = domain[name].expand(shape).reshape(-1)
     num_steps = inputs.mask.long().sum(-1).expand(shape).reshape(-1).tolist()
     times = signals.start_times.tolist()
     own = signals.actions().numpy() if signals.has_action_effects else None
