@@ -70,7 +70,11 @@ def finding_of(
     ]
     is_zero = bool(sizes) and max(sizes) < VERDICT.fewest_deviations
     whole = sum(other.share for other in search.missing)
-    is_small = search.is_approximate and added.share <= VERDICT.minor_share * whole
+    is_small = (
+        search.is_approximate
+        and added.share <= VERDICT.minor_share * whole
+        and (search.has_stopped or effect.name in search.minor)
+    )
     alternatives = [
         name
         for name, probability in added.alternatives.items()

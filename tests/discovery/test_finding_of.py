@@ -7,13 +7,15 @@ from npdr_ppl.discovery.search.alternatives import Added
 from npdr_ppl.models.effects import ActuatorGain
 
 
-def told(alternatives):
+def told(alternatives, share=0.3, **searched):
     effect = ActuatorGain("left")
-    added = Added(effect, effect.name, 0.3, alternatives)
+    added = Added(effect, effect.name, share, alternatives)
     final = SimpleNamespace(
         names=(effect.name,), simulator=SimpleNamespace(corrected_number=lambda effect: "")
     )
-    search = SimpleNamespace(missing=[added], is_approximate=False, final=final)
+    other = Added(ActuatorGain("right"), "right.actuator_gain", 0.6, {})
+    state = {"is_approximate": False, "has_stopped": False, "minor": frozenset()} | searched
+    search = SimpleNamespace(missing=[added, other], final=final, **state)
     return finding_of(added, search, {}, (), None, [])
 
 
@@ -29,3 +31,11 @@ def test_the_same_law_elsewhere_is_told_by_its_whole_name():
     assert "right.actuator_gain" in found.equivalent_to
     assert "viscous_friction" in found.equivalent_to
     assert not {"actuator_gain", "actuator_lag", "right.actuator_lag"} & set(found.equivalent_to)
+
+
+def test_a_small_effect_is_one_that_can_go_with_all_other_small_ones():
+    """Each of a delay and a lag can go alone, because the other takes its place."""
+    one = {"left.actuator_gain": 1.0}
+    small = {"share": 0.02, "is_approximate": True}
+    assert told(one, **small, minor=frozenset({"left.actuator_gain"})).is_minor
+    assert not told(one, **small).is_minor

@@ -228,7 +228,7 @@ class Searcher(OriginalModel):
         base = rounds[0].hypothesis
         added: list[Added] = []
         trials: dict[tuple[str, str], Hypothesis] = {}
-        is_approximate = False
+        is_approximate, minor = False, frozenset[str]()
         if current.effects and self._deadline.stops():
             current, added, trials = self._compared(current, rounds)
             return Search(rounds, current, added, trials, has_stopped=True)
@@ -239,8 +239,11 @@ class Searcher(OriginalModel):
             candidates = candidates_at(base, self.options)
             self._report("seeing whether simpler laws, or fewer, explain as much")
             if is_approximate:
-                current = simplest_laws(base, current, candidates, self.trials, self._report)
+                current, minor = simplest_laws(
+                    base, current, candidates, self.trials, self._report
+                )
             else:
+                minor = frozenset()
                 current = plausible_laws(
                     current, candidates, self.trials, self._report, most=max_effects
                 )
@@ -254,7 +257,7 @@ class Searcher(OriginalModel):
             added = [each for each in added if each.effect.name in current.names]
         is_approximate = is_something_left(rounds[0], self._looked(current, rounds))
         stopped = self._deadline.has_stopped
-        return Search(rounds, current, added, trials, is_approximate, stopped)
+        return Search(rounds, current, added, trials, is_approximate, stopped, minor)
 
     def _compared(
         self, current: Hypothesis, rounds: list[Round], *, is_approximate: bool = False

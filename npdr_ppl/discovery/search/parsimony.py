@@ -28,7 +28,7 @@ def simplest_laws(
     candidates: Sequence[Effect],
     trials: Trials,
     report: Callable[[str], None] = lambda _: None,
-) -> Hypothesis:
+) -> tuple[Hypothesis, frozenset[str]]:
     """Leaves out or simplifies laws, as long as little of the explanation is lost.
 
     This is for models that leave something unexplained, whose laws are approximations.
@@ -39,6 +39,11 @@ def simplest_laws(
         candidates: Effects that may be added to the original model.
         trials: Fits the model.
         report: Called with a sentence about each change.
+
+    Returns:
+        The model, and the names of its effects that together explain little. Of two that explain
+        much together and can stand in for each other, as a delay and a lag, only one is among
+        them.
     """
     left, minor = current, list[tuple[Effect, Mapping[str, Tensor]]]()
     reference = current
@@ -69,8 +74,9 @@ def simplest_laws(
             minor.append((effect, {s: before.parameters[s] for s in effect.parameter_names}))
             report(f"{effect.name} is left out: it explains too little")
     if left is current:
-        return current
-    return _with_minor(current, left, minor, trials, report)
+        return current, frozenset()
+    found = _with_minor(current, left, minor, trials, report)
+    return found, frozenset(set(found.names) - set(left.names))
 
 
 def plausible_laws(

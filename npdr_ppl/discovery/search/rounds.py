@@ -95,6 +95,7 @@ class Search:
             be compared.
         is_approximate: Whether something remains that no law of the catalogue explains.
         has_stopped: Whether a time limit ended it before all was tried.
+        minor: Names of effects of an approximate model that together explain little.
     """
 
     rounds: list[Round]
@@ -103,6 +104,7 @@ class Search:
     trials: dict[tuple[str, str], Hypothesis]
     is_approximate: bool = False
     has_stopped: bool = False
+    minor: frozenset[str] = frozenset()
 
     @property
     def missing(self) -> list[Added]:

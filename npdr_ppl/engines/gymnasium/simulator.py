@@ -111,13 +111,13 @@ class GymnasiumSimulator(SteppedSimulator):
                 "Workers make their environments themselves: give an id or a function that makes "
                 f"one, not {environment!r}."
             )
-        given = {
+        functions = {
             "set_parameters": set_parameters,
             "set_state": set_state,
             "read": read,
             "act": act,
         }
-        for name, function in given.items():
+        for name, function in functions.items():
             _check_function(name, function)
         self._make = environment
         self.is_deterministic = is_deterministic
