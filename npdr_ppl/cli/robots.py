@@ -83,9 +83,10 @@ def _expected_time(path: Path, robot: "MujocoSimulator") -> dict[str, float | No
 def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
     """Returns what is known of a robot, for JSON."""
     rates = {state.name: state.rate_of for state in robot.states}
+    limits = _joint_limits(robot)
 
     def column(channel: "Channel", role: str) -> dict[str, Any]:
-        ends = [channel.lower, channel.upper]
+        ends = limits.get(channel.name, [channel.lower, channel.upper])
         return {
             "name": channel.name,
             "unit": channel.unit,
@@ -117,6 +118,22 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
     }
 
 
+def _joint_limits(robot: "MujocoSimulator") -> dict[str, list[float]]:
+    """Returns the limits of joints whose positions are states, by the state's name.
+
+    They show whether the file's angles were read in the unit that was meant.
+    """
+    model = robot.model
+    joints = {int(address): joint for joint, address in enumerate(model.jnt_qposadr)}
+    return {
+        state.name: model.jnt_range[joints[component.address]].tolist()
+        for component, state in zip(robot.components, robot.states, strict=True)
+        if not component.is_velocity
+        and component.address in joints
+        and model.jnt_limited[joints[component.address]]
+    }
+
+
 def _lines(found: dict[str, Any]) -> list[str]:
     """Returns the description as text."""
     from npdr_ppl.preparation.expected_time import FEWEST_FITS, MOST_FITS
@@ -140,10 +157,10 @@ def _lines(found: dict[str, Any]) -> list[str]:
     rows = [("column of a log", "unit", "")]
     rows += [("time", "s", "constant steps, also other ones than the file's")]
     for c in columns:
-        remark = "may be left out" if c["may be left out"] else ""
+        span = "" if c["range"] is None else "{:.4g} … {:.4g}".format(*c["range"])
+        remark = "may be left out" if c["may be left out"] else span
         if c["role"] == "command":
-            span = "" if c["range"] is None else ", {:.4g} … {:.4g}".format(*c["range"])
-            remark = f"command{span}"
+            remark = f"command, {span}" if span else "command"
         rows.append((c["name"], c["unit"], remark))
     lines += ["", *_table(rows)]
     if not any(c["role"] == "command" for c in columns):

@@ -258,7 +258,8 @@ class Investigation:
             self._searcher.found_options,
             seed=self.seed,
             progress=self.progress,
-            is_approximate=self.search.is_approximate or self.search.has_stopped,
+            is_approximate=self.search.is_approximate,
+            is_late=self.search.has_stopped,
         )
 
     @cached_property

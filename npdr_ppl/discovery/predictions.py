@@ -32,8 +32,8 @@ class Predictions:
         options: How the recording that was searched is prepared.
         seed: Seed of everything random.
         progress: Shows the stages, and records how long they take.
-        is_approximate: Whether the revised model leaves something unexplained, or may do so
-            because the search was ended early.
+        is_approximate: Whether the revised model leaves something unexplained.
+        is_late: Whether the search was ended early, so that nothing further may take long.
     """
 
     def __init__(
@@ -47,6 +47,7 @@ class Predictions:
         seed: int,
         progress: SearchProgress,
         is_approximate: bool,
+        is_late: bool,
     ) -> None:
         self._given = given
         self._rollouts = rollouts
@@ -54,6 +55,7 @@ class Predictions:
         self._options = options
         self._seed = seed
         self._progress = progress
+        self._is_late = is_late
         # A model that lacks, or may lack, effects predicts; its intervals may be wrong anyway.
         self._lacks_effects = [given] if given is not revised else []
         self._lacks_effects += [revised] if is_approximate else []
@@ -68,7 +70,9 @@ class Predictions:
         with self._progress.timed(f"posterior {len(self._drawn) + 1}"):
             self._progress.say("drawing parameters")
             is_rough = any(hypothesis is one for one in self._lacks_effects)
-            draws = posterior_draws(hypothesis, seed=self._seed, is_rough=is_rough)
+            draws = posterior_draws(
+                hypothesis, seed=self._seed, is_rough=is_rough, is_late=self._is_late
+            )
         self._drawn.append((hypothesis, draws))
         return draws
 

@@ -90,6 +90,8 @@ def optimise_policy(
     for iteration in range(iterations):
         stream = torch.Generator().manual_seed(derived_seed(seed, "policy search", iteration))
         candidates = search.ask(state, stream)
+        if progress is not None and iteration == 0:
+            progress(0.0, f"the first {len(candidates)} policies in {len(domains)} domains")
         starts = task.initial_states(num_initial_states, stream)
         returns = returns_of(
             task,

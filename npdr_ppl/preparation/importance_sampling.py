@@ -34,6 +34,7 @@ __all__ = [
     "WeightedDraws",
     "effective_size",
     "heavy_tailed",
+    "laplace_draws",
     "sample_posterior",
     "smoothed_weights",
 ]
@@ -191,8 +192,28 @@ def sample_posterior(
     assert result is not None
     is_nearly_normal = result.iterations == 1 and not given
     if space.num_weak and result.is_reliable and not is_nearly_normal:
+        report(f"{len(z)} draws, moving some of them along the posterior's ridges")
         return _moved(result, target, likelihood, seed)
     return result
+
+
+def laplace_draws(likelihood: SegmentLikelihood, num: int, *, seed: int) -> Tensor:
+    """Draws from Laplace's approximation of the posterior at the closest fit, ``(≤ num, d)``.
+
+    It takes no simulations beside the derivatives at the fit. Draws outside the prior's support
+    are left out.
+
+    Args:
+        likelihood: The recording's likelihood.
+        num: Number of draws.
+        seed: Seed of the draws.
+    """
+    space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=True)
+    mean, covariance = space.moments()
+    with seeded(seed, "laplace"):
+        w = torch.distributions.MultivariateNormal(mean, covariance).sample((num,))
+    z, inside = space.to_reference(w)
+    return z[inside]
 
 
 def _moved(

@@ -98,6 +98,15 @@ def test_a_fit_needs_only_the_file_and_a_log(folder, tmp_path, monkeypatch, caps
     assert arm.body("hand").mass[0] == found["hand_mass"]["mean"]
 
 
+def test_inspect_shows_limits_of_joints_in_its_own_unit(folder, monkeypatch, capsys):
+    """A file without ``angle="radian"`` has degrees, which is easily overlooked."""
+    links = folder / "parts" / "links.xml"
+    links.write_text(links.read_text().replace('name="elbow"', 'name="elbow" range="-1 2"'))
+    code, out, _ = run(monkeypatch, capsys, "inspect", folder / "arm.xml")
+    assert code == 0
+    assert re.search(r"elbow +rad +-1 … 2", out)
+
+
 def test_inspect_prints_and_writes_the_model(folder, tmp_path, monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, "inspect", folder / "arm.xml")
     assert code == 0

@@ -163,3 +163,21 @@ def test_a_ridge_is_traced_inside_the_support(monkeypatch):
     space = RidgeCoordinates.of(hypothesis.likelihood, seed=0)
     assert simulated[1] == (simulated[0] + 1) // 2
     assert bool(space.bend.coefficients.isfinite().all())
+
+
+def test_draws_after_a_time_limit_are_not_simulated(monkeypatch):
+    hypothesis = fitted(())
+    exact, most = posterior_draws(hypothesis, seed=0), []
+    log_prob = SegmentLikelihood.log_prob
+
+    def counted(likelihood, z, *rest):
+        most.append(len(z))
+        return log_prob(likelihood, z, *rest)
+
+    monkeypatch.setattr(SegmentLikelihood, "log_prob", counted)
+    draws = posterior_draws(hypothesis, seed=0, is_late=True)
+    found, expected = (estimates(hypothesis, each, {}) for each in (draws, exact))
+    for name, value in expected.items():
+        assert abs(found[name].mean - value.mean) < 0.3 * value.sd
+        assert 0.7 < found[name].sd / value.sd < 1.4
+    assert max(most, default=0) < 100

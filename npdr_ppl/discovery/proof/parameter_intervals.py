@@ -10,7 +10,7 @@ from torch import Tensor
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.settings import INTERVALS
 from npdr_ppl.inference.parts.samplers.importance_weights import systematic
-from npdr_ppl.preparation.importance_sampling import sample_posterior
+from npdr_ppl.preparation.importance_sampling import laplace_draws, sample_posterior
 from npdr_ppl.randomness import derived_seed
 
 __all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
@@ -71,7 +71,9 @@ class Draws:
         return self.z[systematic(self.weights.log(), num)]
 
 
-def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False) -> Draws:
+def posterior_draws(
+    hypothesis: Hypothesis, *, seed: int, is_rough: bool = False, is_late: bool = False
+) -> Draws:
     """Returns draws of the posterior, given the recording.
 
     They come from adaptive importance sampling; see
@@ -80,14 +82,19 @@ def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False
     Args:
         hypothesis: The fitted model.
         seed: Seed of the draws.
-        is_rough: Whether rough intervals will do, because the model lacks effects or the time is
-            over: then the draws take at most ``INTERVALS.rough_iterations`` proposals, and ridges
-            are taken as straight.
+        is_rough: Whether rough intervals will do, because the model lacks effects: then the draws
+            take at most ``INTERVALS.rough_iterations`` proposals, and ridges are taken as straight.
+        is_late: Whether to take no time for simulations: then the draws are those of Laplace's
+            approximation.
 
     Raises:
         DataError: Simulations fail close to the fit.
     """
     own_seed = derived_seed(seed, "discovery", "posterior")
+    if is_late:
+        z = laplace_draws(hypothesis.likelihood, INTERVALS.late_draws, seed=own_seed)
+        if len(z):
+            return Draws(z, torch.full((len(z),), 1.0 / len(z), dtype=torch.float64))
     found = sample_posterior(
         hypothesis.likelihood,
         seed=own_seed,

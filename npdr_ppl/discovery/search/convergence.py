@@ -1,6 +1,6 @@
 """Fits, until convergence, of the candidates that are likeliest after short fits."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
@@ -82,6 +82,7 @@ def converge_along_best(
     current: Hypothesis,
     *,
     progress: Step = lambda fraction, status: None,
+    stops: Callable[[], bool] = lambda: False,
 ) -> dict[str, Hypothesis]:
     """Fits the likeliest trials until convergence, with initial states of the best one's motion.
 
@@ -96,6 +97,7 @@ def converge_along_best(
         tried: The model with each of several effects, all along the same segments.
         current: The model without them, along all segments.
         progress: Called with the fraction of these trials that has converged.
+        stops: Returns whether the time is over. Then trials along all segments stay as they are.
 
     Returns:
         The models along all segments.
@@ -104,6 +106,8 @@ def converge_along_best(
         return {}
     part = next(iter(tried.values())).segments
     whole, num = current.segments.inputs.num_segments, part.inputs.num_segments
+    if num == whole and stops():
+        return dict(tried)
     # A part is enough only where the best candidate explains very much.
     is_much = num < whole or (
         log_evidence(current, closest(list(tried.values()))) > TRIALS.enough_evidence

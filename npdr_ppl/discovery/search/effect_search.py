@@ -327,7 +327,9 @@ class Searcher(OriginalModel):
         if not trials:
             return None, {}, {}
         progress = self._progress.stage(label)
-        trials = converge_along_best(self.trials, trials, current, progress=progress)
+        trials = converge_along_best(
+            self.trials, trials, current, progress=progress, stops=self._deadline.stops
+        )
         if not trials:
             return None, {}, {}
         each = math.log(SEARCH.prior_of_any / max(1, len(ranking)))

@@ -51,7 +51,7 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
     units = {name: estimate.unit for name, estimate in discovery.parameters.items()}
     drawn = discovery.draws
     if after is not None:
-        drawn = posterior_draws(start, seed=seed, is_rough=True)
+        drawn = posterior_draws(start, seed=seed, is_late=True)
     prior, draws = _draws(start, drawn, seed)
     posteriors = {BEFORE: draws}
     if after is not None:

@@ -219,6 +219,7 @@ def test_a_log_needs_a_mapping(tmp_path):
         (["__time", "/a/header/stamp", "/a/x"], "__time"),
         (["Time (ms)", "x"], "Time (ms)"),
         (["time_us", "x"], "time_us"),
+        (["TS_ms", "x"], "TS_ms"),
         (["/a/header/stamp", "x"], "/a/header/stamp"),
         (["/a/header/stamp", "/b/header/stamp"], None),
         (["x", "T"], "T"),

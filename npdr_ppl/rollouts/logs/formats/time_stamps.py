@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 _NAMES = (
     *("time", "timestamp", "timestamps", "__time", "%time", "t", "tout", "stamp", "header/stamp"),
-    *("log_time", "elapsed", "elapsed_time", "sample_time", "datetime"),
+    *("log_time", "elapsed", "elapsed_time", "sample_time", "datetime", "ts"),
 )
 """Names of time stamps, the most usual ones first; in lower case, without a unit."""
 
