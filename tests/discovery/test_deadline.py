@@ -67,12 +67,12 @@ def test_a_search_keeps_what_it_found_in_time(dragged):
 
 
 @pytest.mark.slow
-def test_draws_of_a_search_that_was_ended_early_are_rough(dragged, monkeypatch):
+def test_draws_of_a_search_that_was_ended_early_are_not_simulated(dragged, monkeypatch):
     case, _ = dragged
     asked = []
 
-    def drawn(hypothesis, *, seed, is_rough):
-        asked.append(is_rough)
+    def drawn(hypothesis, *, seed, is_rough, is_late):
+        asked.append(is_late)
 
     monkeypatch.setattr("npdr_ppl.discovery.predictions.posterior_draws", drawn)
     options = npdr.DiscoveryOptions(effects=EFFECTS, time_limit=1e-6)

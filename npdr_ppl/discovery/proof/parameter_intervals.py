@@ -83,7 +83,7 @@ def posterior_draws(
         hypothesis: The fitted model.
         seed: Seed of the draws.
         is_rough: Whether rough intervals will do, because the model lacks effects: then the draws
-            take at most ``INTERVALS.rough_iterations`` proposals, and ridges are taken as straight.
+            take at most ``INTERVALS.rough_iterations`` proposals, and ridges are straight.
         is_late: Whether to take no time for simulations: then the draws are those of Laplace's
             approximation.
 
