@@ -1,7 +1,7 @@
 """Priors of single numbers as a name and arguments, so that files can keep them."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pyro.distributions
@@ -41,12 +41,11 @@ def read_prior(written: Mapping[str, Any]) -> Distribution:
         DataError: It is no such prior.
     """
     arguments = {word: value for word, value in written.items() if word != _NAME}
-    cls = getattr(pyro.distributions, str(written.get(_NAME)), None)
+    found = getattr(pyro.distributions, str(written.get(_NAME)), None)
     try:
-        if not (inspect.isclass(cls) and issubclass(cls, Distribution)):
+        if not (inspect.isclass(found) and issubclass(found, Distribution)):
             raise ValueError(f"no distribution {written.get(_NAME)!r}")
-        numbers = {word: float(value) for word, value in arguments.items()}
-        prior: Distribution = cls(**numbers, validate_args=True)
+        make: Callable[..., Distribution] = found
+        return make(**{word: float(value) for word, value in arguments.items()}, validate_args=True)
     except (TypeError, ValueError) as error:
         raise DataError(f"{dict(written)} is no prior of one number: {error}") from error
-    return prior
