@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import pyro.distributions
 from torch import Tensor
@@ -45,7 +45,8 @@ def read_prior(written: Mapping[str, Any]) -> Distribution:
     try:
         if not (inspect.isclass(found) and issubclass(found, Distribution)):
             raise ValueError(f"no distribution {written.get(_NAME)!r}")
-        make: Callable[..., Distribution] = found
-        return make(**{word: float(value) for word, value in arguments.items()}, validate_args=True)
+        make = cast(Callable[..., Distribution], found)
+        numbers = {word: float(value) for word, value in arguments.items()}
+        return make(**numbers, validate_args=True)
     except (TypeError, ValueError) as error:
         raise DataError(f"{dict(written)} is no prior of one number: {error}") from error
