@@ -213,7 +213,7 @@ class CauseEffectRecord(TypedDict):
     effect: str
     port: str
     constants: dict[str, float]
-    priors: NotRequired[dict[str, dict[str, Any] | None]]
+    priors: dict[str, dict[str, Any] | None]
 
 
 class CauseRecord(TypedDict):

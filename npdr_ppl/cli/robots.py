@@ -124,7 +124,7 @@ def _joint_limits(robot: "MujocoSimulator") -> dict[str, list[float]]:
     They show whether the file's angles were read in the unit that was meant.
     """
     model = robot.model
-    joints = {int(address): joint for joint, address in enumerate(model.jnt_qposadr)}
+    joints = {port.position: port.joint for port in robot.force_ports}  # hinges and slides
     return {
         state.name: model.jnt_range[joints[component.address]].tolist()
         for component, state in zip(robot.components, robot.states, strict=True)
@@ -158,7 +158,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
     rows += [("time", "s", "constant steps, also other ones than the file's")]
     for c in columns:
         span = "" if c["range"] is None else "{:.4g} … {:.4g}".format(*c["range"])
-        remark = "may be left out" if c["may be left out"] else span
+        limits = f"joint limits {span}" if span else ""
+        remark = "may be left out" if c["may be left out"] else limits
         if c["role"] == "command":
             remark = f"command, {span}" if span else "command"
         rows.append((c["name"], c["unit"], remark))

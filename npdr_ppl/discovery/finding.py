@@ -30,7 +30,8 @@ class Finding:
             recording cannot distinguish from an implausible one. The law may then equal another
             law.
         is_minor: Whether it explains too little to be named: no strength differs from zero by two
-            standard deviations, or its share is small and something remains that no law explains.
+            standard deviations, or something remains that no law explains, its share is small, and
+            little is lost without it and all other small ones.
         corrects: Number of the model that it corrects; empty if it is a missing effect. See
             :meth:`~npdr_ppl.language.simulator.Simulator.corrected_number`.
         repetition: Its strengths in parts of the recording; ``None`` for short recordings.

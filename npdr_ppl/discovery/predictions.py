@@ -11,6 +11,7 @@ from npdr_ppl.discovery.proof.parameter_intervals import (
     Estimate,
     estimates,
     posterior_draws,
+    quick_draws,
 )
 from npdr_ppl.discovery.search_progress import SearchProgress
 from npdr_ppl.preparation.data_options import DataOptions
@@ -56,7 +57,7 @@ class Predictions:
         self._seed = seed
         self._progress = progress
         self._is_late = is_late
-        # A model that lacks, or may lack, effects predicts; its intervals may be wrong anyway.
+        # A model that lacks effects predicts; its intervals may be wrong anyway.
         self._lacks_effects = [given] if given is not revised else []
         self._lacks_effects += [revised] if is_approximate else []
         self._drawn: list[tuple[Hypothesis, Draws]] = []
@@ -69,10 +70,11 @@ class Predictions:
                 return draws
         with self._progress.timed(f"posterior {len(self._drawn) + 1}"):
             self._progress.say("drawing parameters")
-            is_rough = any(hypothesis is one for one in self._lacks_effects)
-            draws = posterior_draws(
-                hypothesis, seed=self._seed, is_rough=is_rough, is_late=self._is_late
-            )
+            if self._is_late:
+                draws = quick_draws(hypothesis, seed=self._seed)
+            else:
+                is_rough = any(hypothesis is one for one in self._lacks_effects)
+                draws = posterior_draws(hypothesis, seed=self._seed, is_rough=is_rough)
         self._drawn.append((hypothesis, draws))
         return draws
 

@@ -229,10 +229,10 @@ def _trusted_remedy(
     best, least = _best(remedies(sensors, rollouts, suspects, singly=singly), ratio, report)
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
-    if best is not None and _is_early(best) and trials.ratio_with_lag() <= least:
-        # It is the device that answers late: what follows is for discovery to name.
-        return None
     if best is not None and least < REPAIR.remedy_factor:
+        if _is_early(best) and trials.ratio_with_lag() <= least:
+            # It is the device that answers late, which is for discovery to name.
+            return None
         without = trials.ratio_without(best)
     else:
         # A channel is given up only if nothing else helps.
@@ -247,7 +247,7 @@ def _trusted_remedy(
 
 
 def _is_early(remedy: Remedy) -> bool:
-    """Returns whether a remedy takes time stamps of commands for early ones."""
+    """Returns whether a remedy treats the commands' time stamps as too early."""
     shift = remedy.apply
     return isinstance(shift, Shift) and shift.channel is None and shift.steps < 0.0
 

@@ -154,9 +154,10 @@ class RemedyTrials:
         return 1.0 if again is None else min(1.0, relative_misfit(misfits_of(again), self.present))
 
     def ratio_with_lag(self) -> float:
-        """Returns the relative misfit of the recording as it was read, if commands are lagged.
+        """Returns the relative misfit of the recording as it was read, with a lag of the device.
 
-        A motor's first-order lag looks like time stamps of commands that are early.
+        The lag is of first order, one for all commands of each kind. It looks like time stamps of
+        commands that are too early.
         """
         simulator = only_simulator(self._model)[0].simulator
         widest: dict[str, Effect] = {}
@@ -164,8 +165,11 @@ class RemedyTrials:
             kind = simulator.port(lag.port).kind
             if kind not in widest or len(lag.channels) > len(widest[kind].channels):
                 widest[kind] = lag
-        model = with_effects(self._model, tuple(widest.values()))
-        tried = self._windows.fitted(model, self._rollouts, self._as_read) if widest else None
+        try:
+            model = with_effects(self._model, tuple(widest.values()))
+            tried = self._windows.fitted(model, self._rollouts, self._as_read) if widest else None
+        except NpdrError:
+            return math.inf
         return math.inf if tried is None else relative_misfit(misfits_of(tried), self.present)
 
     def ratio_with_wider_priors(self, as_read: Hypothesis) -> float:

@@ -115,9 +115,9 @@ def _distribution(prior: Distribution) -> str | None:
     written = written_prior(prior)
     if written is None:
         return None
-    name, *arguments = written.items()
-    given = ", ".join(f"{word}={value!r}" for word, value in arguments)
-    return f"pyro.distributions.{name[1]}({given})"
+    name = written.pop("distribution")
+    given = ", ".join(f"{word}={value!r}" for word, value in written.items())
+    return f"pyro.distributions.{name}({given})"
 
 
 def _base(model: Model) -> tuple[str, str, Path | None]:

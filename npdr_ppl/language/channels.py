@@ -67,9 +67,11 @@ class Port:
         rated: Typical magnitude, in ``unit``; effects scale their priors by it.
         rated_speed: Typical speed of a joint that a force or a servo acts on, in its coordinate
             per second.
-        rated_position: Typical excursion of such a joint, in its coordinate.
+        rated_position: Typical excursion of such a joint, in its coordinate; of a mass, the
+            length of what carries it.
         coordinate: Unit of the position of a joint that a force or a servo acts on: ``"rad"`` for
-            a revolute, ``"m"`` for a prismatic joint.
+            a revolute, ``"m"`` for a prismatic joint, and for a mass that can be anywhere on its
+            body.
         rated_force: Typical force of a servo, in :attr:`force_unit`.
         joint: Name of the port of the force at the joint that a servo moves; empty if there is
             none.

@@ -19,7 +19,7 @@ def written_prior(prior: Distribution) -> dict[str, Any] | None:
     """Returns a prior's name in Pyro, under ``"distribution"``, and its arguments.
 
     ``None`` if it is none of Pyro's own distributions, or not of one number with numbers as
-    arguments.
+    arguments, or cannot be made again from these.
     """
     name = type(prior).__name__
     if getattr(pyro.distributions, name, None) is not type(prior):
@@ -31,6 +31,10 @@ def written_prior(prior: Distribution) -> dict[str, Any] | None:
             written[word] = value.item()
         elif word != "validate_args":
             return None
+    try:
+        read_prior(written)
+    except DataError:
+        return None
     return written
 
 
@@ -47,6 +51,9 @@ def read_prior(written: Mapping[str, Any]) -> Distribution:
             raise ValueError(f"no distribution {written.get(_NAME)!r}")
         make = cast(Callable[..., Distribution], found)
         numbers = {word: float(value) for word, value in arguments.items()}
-        return make(**numbers, validate_args=True)
-    except (TypeError, ValueError) as error:
+        prior = make(**numbers, validate_args=True)
+        if prior.batch_shape or prior.event_shape:
+            raise ValueError("several numbers")
+        return prior
+    except (TypeError, ValueError, AttributeError, NotImplementedError) as error:
         raise DataError(f"{dict(written)} is no prior of one number: {error}") from error

@@ -301,9 +301,6 @@ def _cause(
     """Returns a stored cause of a model; ``laws`` are the learned formulas by effect."""
     effects = [_effect(described, run, laws) for described in part["effects"]]
     for effect in effects:
-        simulator = only_simulator(model)[0].simulator
-        if simulator.corrected_number(effect):
-            effect = effect.of_either_sign(simulator.port(effect.port))
         model = add_effect(model, effect)
     try:
         prior = prior_of(model, time_step)
@@ -335,8 +332,14 @@ def _effect(described: Mapping[str, Any], run: Path, laws: Mapping[str, str]) ->
             f"{run} learned the law {laws[name]}, but the added effect {name!r} has another, "
             f"{cls.law}; give `npdr effects --remove {name}` and `npdr effects --add {file}`."
         )
-    written = described.get("priors", {}).items()
-    priors = {n: read_prior(prior) for n, prior in written if prior is not None}
+    priors = {}
+    for parameter, written in described["priors"].items():
+        if written is None:
+            raise DataError(
+                f"{run} was searched with a prior of {parameter} of {name} that no file can keep; "
+                "search again with one of Pyro's own distributions."
+            )
+        priors[parameter] = read_prior(written)
     effect = cls(described["port"], priors=priors)
     constants = dict(described["constants"])
     if constants != effect.constants and effect.has_ripples:

@@ -104,7 +104,7 @@ def test_inspect_shows_limits_of_joints_in_its_own_unit(folder, monkeypatch, cap
     links.write_text(links.read_text().replace('name="elbow"', 'name="elbow" range="-1 2"'))
     code, out, _ = run(monkeypatch, capsys, "inspect", folder / "arm.xml")
     assert code == 0
-    assert re.search(r"elbow +rad +-1 … 2", out)
+    assert re.search(r"elbow +rad +joint limits -1 … 2", out)
 
 
 def test_inspect_prints_and_writes_the_model(folder, tmp_path, monkeypatch, capsys):

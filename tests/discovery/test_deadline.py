@@ -71,16 +71,16 @@ def test_draws_of_a_search_that_was_ended_early_are_not_simulated(dragged, monke
     case, _ = dragged
     asked = []
 
-    def drawn(hypothesis, *, seed, is_rough, is_late):
-        asked.append(is_late)
+    def drawn(hypothesis, *, seed):
+        asked.append(hypothesis)
 
-    monkeypatch.setattr("npdr_ppl.discovery.predictions.posterior_draws", drawn)
+    monkeypatch.setattr("npdr_ppl.discovery.predictions.quick_draws", drawn)
     options = npdr.DiscoveryOptions(effects=EFFECTS, time_limit=1e-6)
     investigation = Investigation(case.model, case.fit, search=options)
     search = investigation.search
     assert search.has_stopped and not search.is_approximate
     investigation._predictions.draws(search.final)
-    assert asked == [True]
+    assert asked == [search.final]
 
 
 def test_a_model_that_lacks_nothing_needs_no_further_time(quiet):

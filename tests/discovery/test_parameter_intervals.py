@@ -12,7 +12,12 @@ from torch.distributions import MultivariateNormal
 
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
-from npdr_ppl.discovery.proof.parameter_intervals import Draws, estimates, posterior_draws
+from npdr_ppl.discovery.proof.parameter_intervals import (
+    Draws,
+    estimates,
+    posterior_draws,
+    quick_draws,
+)
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.models.effects import Spring
 from npdr_ppl.models.pendulum import Pendulum
@@ -175,7 +180,7 @@ def test_draws_after_a_time_limit_are_not_simulated(monkeypatch):
         return log_prob(likelihood, z, *rest)
 
     monkeypatch.setattr(SegmentLikelihood, "log_prob", counted)
-    draws = posterior_draws(hypothesis, seed=0, is_late=True)
+    draws = quick_draws(hypothesis, seed=0)
     found, expected = (estimates(hypothesis, each, {}) for each in (draws, exact))
     for name, value in expected.items():
         assert abs(found[name].mean - value.mean) < 0.3 * value.sd

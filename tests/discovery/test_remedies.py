@@ -427,3 +427,28 @@ def test_a_refusal_after_a_fault_keeps_the_columns_names():
         DataError, match=r"angle never changes.* not used; the column angle is mis"
     ):
         repair(pendulum, frozen, npdr.DataOptions())
+
+
+@pytest.mark.parametrize(("lag", "is_applied"), [(0.2, False), (0.6, True)])
+def test_early_stamps_must_explain_more_than_a_lag_of_the_device(monkeypatch, lag, is_applied):
+    early = Shift(None, -3.0).remedy
+
+    class Tried:
+        present = {"angle": 1.0}
+
+        def ratio(self, remedy):
+            return 0.3 if remedy.sentence == early.sentence else 1.0
+
+        def ratio_without(self, remedy):
+            return 1.0
+
+        def ratio_with_lag(self):
+            return lag
+
+    monkeypatch.setattr(recording_repair, "RemedyTrials", lambda *_: Tried())
+    monkeypatch.setattr(recording_repair, "remedies", lambda *_, **__: [early])
+    rollouts = swinging()
+    found = recording_repair._trusted_remedy(
+        pendulum, rollouts, npdr.DataOptions(segment_length=20), None, None, lambda _: None
+    )
+    assert (found is not None) is is_applied

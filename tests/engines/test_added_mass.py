@@ -66,3 +66,41 @@ def test_priors_scale_with_the_whole_arm() -> None:
     assert float(quantile(priors["x"], torch.tensor(0.975))) == pytest.approx(
         1.96 * 0.1 * length, rel=1e-3
     )
+
+
+def test_a_hand_without_a_mass_of_its_own_can_carry_one() -> None:
+    """Its mass may be that of a body that is welded on."""
+    text = ARM.format(mass=0.3, inertia=0.001, least=0.0007, load="")
+    start, end = text.index('<inertial pos="0.04'), text.index("</body></body></body>")
+    text = f"{text[:start]}<body>{text[start:end]}</body>{text[end:]}"
+    bare = npdr.MujocoSimulator(mujoco.MjModel.from_xml_string(text))
+    effect = OffsetPayload("payload")
+    loaded = bare.with_effects(effect)
+    inputs = random_inputs(bare, num_steps=20)
+    assert torch.equal(loaded.simulate({}, inputs), bare.simulate({}, inputs))
+    given = {f"{effect.name}.mass": value([0.0, 0.2]), f"{effect.name}.x": value(0.1)}
+    assert loaded.simulate(given, inputs).isfinite().all()
+
+
+def test_an_impossible_mass_costs_only_its_own_simulation() -> None:
+    """The others are as they would be alone."""
+    effect = OffsetPayload("payload")
+    loaded = arm().with_effects(effect)
+    inputs = random_inputs(loaded, num_steps=20)
+    found, alone = (
+        loaded.simulate({f"{effect.name}.mass": value(m), f"{effect.name}.x": value(0.1)}, inputs)
+        for m in ([0.2, float("nan")], [0.2])
+    )
+    assert torch.equal(found[0], alone[0])
+
+
+@pytest.mark.parametrize(
+    ("joint", "least"), [("<freejoint/>", 0.2), ('<joint type="slide" axis="1 0 0"/>', 0.2)]
+)
+def test_a_load_can_be_anywhere_on_a_large_body(joint: str, least: float) -> None:
+    """Its centre of mass is close to the origin."""
+    text = f"""<mujoco><worldbody><body>{joint}
+      <geom type="box" size="0.3 0.1 0.05" mass="8" pos="0.002 0 0"/>
+      </body></worldbody></mujoco>"""
+    port = npdr.MujocoSimulator(mujoco.MjModel.from_xml_string(text)).port("payload")
+    assert port.rated == 8.0 and port.rated_position > least

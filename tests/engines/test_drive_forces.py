@@ -1,5 +1,7 @@
 """Forces of actuators without a call of the engine, against the engine's."""
 
+from typing import Any
+
 import mujoco
 import mujoco.batch
 import numpy as np
@@ -9,6 +11,7 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco.drive_forces import DriveForces, has_direct_drives
 from npdr_ppl.models.effects import CoulombFriction, LoadDependentFriction, PreslidingFriction
+from tests.helpers.mujoco_files import random_inputs, value
 
 JOINTS = """
 <mujoco><compiler autolimits="true"/><worldbody>
@@ -74,3 +77,27 @@ def test_dry_friction_is_the_engines() -> None:
     loaded = simulator.with_effects(dry, LoadDependentFriction("slide_force"))
     assert simulator.with_effects(dry).is_native(dry) and loaded.is_native(dry)
     assert not simulator.with_effects(dry, PreslidingFriction("slide_force")).is_native(dry)
+
+
+def test_simulations_are_those_with_the_engines_forces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shortcut changes no number."""
+    simulator = npdr.MujocoSimulator(model_with(DRIVES))
+    simulator = simulator.with_effects(LoadDependentFriction("hinge_torque"))
+    inputs = random_inputs(simulator, num_steps=50)
+    given = {"hinge_torque.load_dependent_friction.coefficient": value([0.0, 0.3])}
+    found = simulator.simulate(given, inputs)
+    monkeypatch.setattr("npdr_ppl.engines.mujoco.stepper.has_direct_drives", lambda model: False)
+    torch.testing.assert_close(found, simulator.simulate(given, inputs), atol=1e-12, rtol=0.0)
+    assert (found[1] - found[0]).abs().max() > 1e-3
+
+
+def test_a_subclass_with_another_law_is_not_the_engines() -> None:
+    """Only the law itself is."""
+
+    class Half(CoulombFriction):
+        def dry_friction(self, *arguments: Any) -> torch.Tensor:
+            return 0.5 * super().dry_friction(*arguments)
+
+    simulator = npdr.MujocoSimulator(model_with(DRIVES))
+    effect = Half("hinge_torque")
+    assert not simulator.with_effects(effect).is_native(effect)

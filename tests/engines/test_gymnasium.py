@@ -277,7 +277,10 @@ def test_results_do_not_depend_on_what_ran_before():
         ({"parameters": {"mass": Parameter("m", "kg", 1.0)}}, "'m' is given as 'mass'"),
         ({"set_state": None}, "give set_state"),
         ({"sensors": (ANGLE,), "read": "state"}, r"1 sensors.*shape \(2,\)"),
-        ({"read": lambda observation: observation}, "read is .* environment and an observation"),
+        (
+            {"read": lambda observation: observation},
+            "environment and an observation; yours",
+        ),
         ({"set_state": lambda state: None}, "set_state is .* environment and a state"),
         ({"actions": (ANGLE, VELOCITY)}, "1 actions, but 2 were named"),
         ({"rated": {"force": 1.0}}, "force names no channel"),

@@ -28,6 +28,7 @@ def test_a_prior_is_read_as_it_was_written(prior):
 def test_other_priors_are_not_written():
     assert written_prior(dist.Normal(torch.zeros(2), 1.0)) is None
     assert written_prior(torch.distributions.Normal(0.0, 1.0)) is None
+    assert written_prior(dist.Binomial(3, torch.tensor(0.5))) is None
 
 
 @pytest.mark.parametrize(
@@ -38,6 +39,8 @@ def test_other_priors_are_not_written():
         {"distribution": "Normal", "loc": "x", "scale": 1.0},
         {"distribution": "Normal", "loc": 0.0, "scale": -1.0},
         {"distribution": "Normal", "wrong": 0.0},
+        {"distribution": "Delta", "v": 0.0},
+        {"distribution": "Categorical", "probs": 0.5},
     ],
 )
 def test_what_is_no_prior_gets_a_sentence(written):

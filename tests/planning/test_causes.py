@@ -23,7 +23,7 @@ def run(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     folder.mkdir()
     cause = {
-        "effects": [{"effect": "learned_hinge", "port": "hinge", "constants": {}}],
+        "effects": [{"effect": "learned_hinge", "port": "hinge", "constants": {}, "priors": {}}],
         "probability": 1.0,
         "parameters": {"mass": 1.0, "length": 1.0, "hinge.learned_hinge.cubic": 0.01},
         "coordinates": [0.0] * 3,
@@ -61,7 +61,7 @@ def delayed(run):
     """The same folder, with a delay of the sensors as the cause, at the middle of its prior."""
     found = json.loads((run / "discovery.json").read_text())
     (cause,) = found["surviving_causes"]["causes"]
-    delay = {"effect": "sensor_delay", "port": "angle,velocity", "constants": {}}
+    delay = {"effect": "sensor_delay", "port": "angle,velocity", "constants": {}, "priors": {}}
     cause["effects"] = [delay]
     cause["parameters"] = {"mass": 1.0, "length": 1.0, "angle,velocity.sensor_delay.delay": 0.03}
     (run / "discovery.json").write_text(json.dumps(found))

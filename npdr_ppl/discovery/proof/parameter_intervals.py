@@ -13,7 +13,7 @@ from npdr_ppl.inference.parts.samplers.importance_weights import systematic
 from npdr_ppl.preparation.importance_sampling import laplace_draws, sample_posterior
 from npdr_ppl.randomness import derived_seed
 
-__all__ = ["Draws", "Estimate", "estimates", "posterior_draws"]
+__all__ = ["Draws", "Estimate", "estimates", "posterior_draws", "quick_draws"]
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,7 @@ class Draws:
         return self.z[systematic(self.weights.log(), num)]
 
 
-def posterior_draws(
-    hypothesis: Hypothesis, *, seed: int, is_rough: bool = False, is_late: bool = False
-) -> Draws:
+def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False) -> Draws:
     """Returns draws of the posterior, given the recording.
 
     They come from adaptive importance sampling; see
@@ -83,18 +81,13 @@ def posterior_draws(
         hypothesis: The fitted model.
         seed: Seed of the draws.
         is_rough: Whether rough intervals will do, because the model lacks effects: then the draws
-            take at most ``INTERVALS.rough_iterations`` proposals, and ridges are straight.
-        is_late: Whether to take no time for simulations: then the draws are those of Laplace's
-            approximation.
+            take at most ``INTERVALS.rough_iterations`` proposals, and ridges are taken as
+            straight.
 
     Raises:
         DataError: Simulations fail close to the fit.
     """
     own_seed = derived_seed(seed, "discovery", "posterior")
-    if is_late:
-        z = laplace_draws(hypothesis.likelihood, INTERVALS.late_draws, seed=own_seed)
-        if len(z):
-            return Draws(z, torch.full((len(z),), 1.0 / len(z), dtype=torch.float64))
     found = sample_posterior(
         hypothesis.likelihood,
         seed=own_seed,
@@ -103,6 +96,22 @@ def posterior_draws(
     )
     counts = found.weights > 0.0  # without failed simulations, whose parameters can be anything
     return Draws(found.z[counts], found.weights[counts])
+
+
+def quick_draws(hypothesis: Hypothesis, *, seed: int) -> Draws:
+    """Returns draws of Laplace's approximation of the posterior, which take no simulations.
+
+    Rough ones by importance sampling if hardly any of them is in the prior's support.
+
+    Args:
+        hypothesis: The fitted model.
+        seed: Seed of the draws.
+    """
+    own_seed = derived_seed(seed, "discovery", "posterior")
+    z = laplace_draws(hypothesis.likelihood, INTERVALS.quick_draws, seed=own_seed)
+    if len(z) < INTERVALS.fewest_quick:
+        return posterior_draws(hypothesis, seed=seed, is_rough=True)
+    return Draws(z, torch.full((len(z),), 1.0 / len(z), dtype=torch.float64))
 
 
 def estimates(

@@ -22,7 +22,7 @@ from npdr_ppl.rollouts.recording import Recording
 
 __all__ = ["VERSION", "SurvivingCauses", "ranges", "surviving_causes"]
 
-VERSION = 1
+VERSION = 2
 """Version of the format; raised when a reader of the former one would misread it."""
 
 Array = NDArray[np.float64]

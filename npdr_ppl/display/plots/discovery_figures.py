@@ -9,7 +9,7 @@ from npdr_ppl.discovery import Discovery, Investigation
 from npdr_ppl.discovery.discovery_folder import STAGES, Stage
 from npdr_ppl.discovery.discovery_view import short_name
 from npdr_ppl.discovery.hypothesis import Hypothesis
-from npdr_ppl.discovery.proof.parameter_intervals import Draws, posterior_draws
+from npdr_ppl.discovery.proof.parameter_intervals import Draws, quick_draws
 from npdr_ppl.display.plots.comparison_panels import plot_overlaid_marginals
 from npdr_ppl.display.plots.discovery_panels import plot_gap, plot_ranking, plot_separation
 from npdr_ppl.display.plots.fit_figures import scalar_columns
@@ -51,7 +51,7 @@ def write_discovery_figures(discovery: Discovery, out: Path) -> list[Path]:
     units = {name: estimate.unit for name, estimate in discovery.parameters.items()}
     drawn = discovery.draws
     if after is not None:
-        drawn = posterior_draws(start, seed=seed, is_late=True)
+        drawn = quick_draws(start, seed=seed)
     prior, draws = _draws(start, drawn, seed)
     posteriors = {BEFORE: draws}
     if after is not None:

@@ -292,7 +292,10 @@ def _check_function(name: str, function: object) -> None:
     except ValueError:  # it has no signature
         return
     except TypeError as error:
-        raise ModelError(f"{name} is a function of the environment and {_TAKES[name]}.") from error
+        own = inspect.signature(function)
+        raise ModelError(
+            f"{name} is called with the environment and {_TAKES[name]}; yours takes {own}."
+        ) from error
 
 
 class _Simulation:

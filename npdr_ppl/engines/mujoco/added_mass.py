@@ -13,20 +13,19 @@ __all__ = ["with_point_mass"]
 def with_point_mass(
     model: Any,
     body: int,
-    added: Tensor,
+    total: Tensor,
     place: tuple[Tensor, Tensor, Tensor],
     assignments: Assignments,
 ) -> Assignments:
     """Returns the mass, centre and inertia of a body together with a point mass.
 
     The centre moves by d Δm/(m + Δm), and the inertia about it grows by μ (|d|² 1 − d dᵀ) with the
-    reduced mass μ = m Δm/(m + Δm). Without an added mass, or at the centre, the numbers that it
-    would not change are exactly the present ones.
+    reduced mass μ = m Δm/(m + Δm). Without an added mass, all numbers stay exactly as they are.
 
     Args:
         model: A ``mujoco.MjModel``.
         body: Number of the body, of mass m.
-        added: The mass Δm in kg, a number or ``(N,)``.
+        total: The mass of both, m + Δm, in kg, a number or ``(N,)``.
         place: Its place d from the body's centre of mass along the body's axes, in m, likewise.
         assignments: Values to write into the model without it.
     """
@@ -37,17 +36,23 @@ def with_point_mass(
         return torch.stack(torch.broadcast_tensors(*row), dim=-1)
 
     mass = present(model, "body_mass", body, assignments)
-    total = mass + added
+    added = total - mass
+    # A body may have no mass of its own; its share of nothing is nothing.
+    share = torch.where(added == 0.0, 0.0, added / total)
     distance = torch.stack(torch.broadcast_tensors(*place), dim=-1)
     centre, inertia = numbers("body_ipos", 3), numbers("body_inertia", 3)
     turn = numbers("body_iquat", 4)
-    moved = centre + (added / total)[..., None] * distance
+    moved = centre + share[..., None] * distance
     axes = _rotation(turn)
     along = (axes.mT @ distance[..., None])[..., 0]
     square = (along * along).sum(-1)[..., None, None] * torch.eye(3, dtype=torch.float64)
-    reduced = (mass * added / total)[..., None, None]
+    reduced = (mass * share)[..., None, None]
     more = reduced * (square - along[..., None] * along[..., None, :])
-    values, vectors = torch.linalg.eigh(torch.diag_embed(inertia) + more)
+    whole = torch.diag_embed(inertia) + more
+    # One simulation with impossible numbers must not end the others; it is lost by its mass.
+    is_possible = whole.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+    whole = torch.where(is_possible, whole, torch.eye(3, dtype=torch.float64))
+    values, vectors = torch.linalg.eigh(whole)
     vectors = vectors * torch.linalg.det(vectors).sign()[..., None, None]
     is_same = (more == 0.0).all(-1).all(-1)[..., None]
     inertia = torch.where(is_same, inertia, values)

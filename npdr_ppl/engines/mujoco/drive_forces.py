@@ -22,7 +22,7 @@ def has_direct_drives(model: Any) -> bool:
     """Returns whether the force of every actuator follows from command, position and velocity.
 
     Such actuators act on hinges and slides directly, have no state and at most affine laws. Motors
-    and servos are of this kind.
+    and servos are of this kind. The engine must not limit commands, as in a model of a batch.
 
     Args:
         model: A ``mujoco.MjModel``.
@@ -30,8 +30,10 @@ def has_direct_drives(model: Any) -> bool:
     mujoco: Any = importlib.import_module("mujoco")
     hinges_and_slides = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
     off = int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    unlimited = int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
     return bool(
-        np.all(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
+        (model.opt.disableflags & unlimited or not model.actuator_ctrllimited.any())
+        and np.all(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
         and np.isin(model.jnt_type[model.actuator_trnid[:, 0]], hinges_and_slides).all()
         and np.all(model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE))
         and np.all(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))

@@ -29,6 +29,10 @@ _CONTACT = {
 }
 
 
+_FREE = 6
+"""Degrees of freedom of a body that floats."""
+
+
 class EnvironmentPort(NamedTuple):
     """An environment port, with the body that carries the payload if it is a payload port.
 
@@ -101,8 +105,7 @@ def with_environment(
             mass = present(model, "body_mass", port.body, result)
             total = effect.environment(mass, values)
             if isinstance(effect, LoadEffect):
-                place = effect.place(values)
-                result = with_point_mass(model, port.body, total - mass, place, result)
+                result = with_point_mass(model, port.body, total, effect.place(values), result)
             else:
                 result["body_mass", port.body] = total
         elif port.port.name == "gravity":
@@ -142,17 +145,24 @@ def _loaded_bodies(model: Any, driven: NDArray[np.bool_]) -> list[int]:
 def _chain(model: Any, last: int) -> tuple[float, float]:
     """Returns the mass in kg of the moving bodies from the base to the last one, and their length.
 
-    The length in m leads from joint to joint and to the last body's centre of mass.
+    The base of what floats counts as the last body of its own. The length in m leads from joint to
+    joint and to the last body's centre of mass, and is at least the size of this body.
     """
     body, bodies = last, list[int]()
     while body and model.body_weldid[body]:
+        is_floating = model.body_dofnum[body] == _FREE
+        if is_floating and bodies:
+            break
         bodies.append(body)
         body = int(model.body_parentid[body])
     mass = sum(float(model.body_mass[b]) for b in bodies) or float(model.body_subtreemass[last])
     # How far the first body is from the world's origin does not matter.
     offsets = [np.linalg.norm(model.body_pos[b]) for b in bodies[:-1]]
     length = float(sum(offsets) + np.linalg.norm(model.body_ipos[last]))
-    return mass or 1.0, length or float(model.stat.extent)
+    # A rod of length l has the inertia m l²/12.
+    own = float(model.body_mass[last])
+    size = float(np.sqrt(12.0 * model.body_inertia[last].max() / own)) if own else 0.0
+    return mass or 1.0, max(length, size) or float(model.stat.extent)
 
 
 def _has_contacts(model: Any) -> bool:

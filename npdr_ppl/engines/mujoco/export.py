@@ -84,6 +84,9 @@ def export_mjcf(
     original = _Original(before, step, place, has_six_digits=is_urdf(files))
     found = _divided(simulator, given, original)
     chosen = simulator.carrying(e for e in simulator.effects if e.name not in found.refused)
+    if found.refused:
+        # What is not written does not decide where the others go.
+        found = _divided(chosen, given, original)._replace(refused=found.refused)
     text = _new_text(chosen, given, original, found.in_file)
     callbacks = None
     if found.beside:

@@ -1,7 +1,7 @@
 """Laws of effects that MuJoCo has itself, as numbers of its model.
 
-The engine integrates them better than a force that is held for a step, damping implicitly, springs
-at every stage; and all steps of a batch are then one call.
+The engine integrates them better than a force that is held for a step: damping implicitly, springs
+at every stage. And all steps of a batch are one call.
 """
 
 import importlib
@@ -31,6 +31,8 @@ def is_native(
     """
     mujoco: Any = importlib.import_module("mujoco")
     off = int(model.opt.disableflags)
+    if not _has_own_law(effect):
+        return False
     if effect.standard_law == "damping":
         return not off & int(mujoco.mjtDisableBit.mjDSBL_DAMPER)
     if effect.standard_law == "dry friction":
@@ -40,6 +42,13 @@ def is_native(
     # A joint has one spring with one rest position.
     stiffness = [model.jnt_stiffness[port.joint], *np.atleast_1d(_poly(model)[port.joint])]
     return not np.any(stiffness) and ("jnt_stiffness", port.joint) not in bound
+
+
+def _has_own_law(effect: ForceEffect) -> bool:
+    """Returns whether the law is that of the class that declares it as a standard one."""
+    owner = next(cls for cls in type(effect).__mro__ if "standard_law" in vars(cls))
+    laws = "force", "dry_friction"
+    return all(getattr(type(effect), name) is getattr(owner, name) for name in laws)
 
 
 def _poly(model: Any) -> Any:

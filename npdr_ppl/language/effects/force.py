@@ -19,8 +19,8 @@ class ForceEffect(Effect):
     Attributes:
         needs_joint: Whether :meth:`begin_step` is called, which costs the engine two evaluations
             of the accelerations per step.
-        needs_only_drive: Whether that is for the joint's drive alone; engines may then leave its
-            acceleration and inverse inertia NaN, and save the evaluations.
+        needs_only_drive: Whether :meth:`begin_step` reads nothing of the joint's dynamics but
+            :attr:`Joint.drive`. Engines may then leave acceleration and inverse inertia NaN.
         needs_past: Whether its initial memory needs :attr:`Start.displacements`.
         standard_law: ``"damping"`` with the parameter ``damping``, ``"dry friction"`` with
             ``magnitude``, or ``"spring"`` with ``stiffness`` and ``rest``, if the law is one that

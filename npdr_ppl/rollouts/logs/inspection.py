@@ -33,9 +33,6 @@ _UNITS_IN_NAMES = {
 }
 """Units by the last word of a signal's name, in lower case."""
 
-_ROLES_OF_UNITS: dict[str, Role] = {"mm": "position", "deg/s": "velocity"}
-"""What a signal with a unit is if its name does not tell. Metres can be a distance to anything."""
-
 
 @dataclass(frozen=True)
 class SignalSummary:
@@ -46,7 +43,7 @@ class SignalSummary:
         unit: The unit that the log or its name states, ``""`` if none.
         least: Smallest value in ``unit``, NaN if there is no value.
         greatest: Largest value in ``unit``, NaN if there is no value.
-        role: What its name usually means.
+        role: What its name usually means, or its unit.
         place: Its place among the signals of the log, from 0.
     """
 
@@ -159,15 +156,13 @@ def _timing(time: Array, signals: list[tuple[int, Signal]]) -> Timing:
 
 def _summary(signal: Signal, place: int) -> SignalSummary:
     known = signal.values[np.isfinite(signal.values)]
-    unit, role = signal.unit or _unit_in(signal.name), role_of(signal.name)
-    if role == "other":
-        role = _ROLES_OF_UNITS.get(unit, role)
+    unit = signal.unit or _unit_in(signal.name)
     return SignalSummary(
         name=signal.name,
         unit=unit,
         least=float(known.min()) if len(known) else float("nan"),
         greatest=float(known.max()) if len(known) else float("nan"),
-        role=role,
+        role=role_of(signal.name, unit),
         place=place,
     )
 

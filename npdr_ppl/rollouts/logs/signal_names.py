@@ -40,15 +40,26 @@ _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
 )
 """What the names of signals usually mean, the first match first."""
 
+_RATES = frozenset(("deg/s", "rad/s", "rpm"))
+"""Units of rates, of which a name such as ``J1_deg [deg/s]`` has no position."""
 
-def role_of(name: str) -> Role:
-    """Returns what a signal probably is, by its name: a command before a position."""
+_ROLES_OF_UNITS: dict[str, Role] = {"mm": "position", **dict.fromkeys(_RATES, "velocity")}
+"""What a signal is by its unit if its name says nothing; metres can be a distance to anything."""
+
+
+def role_of(name: str, unit: str = "") -> Role:
+    """Returns what a signal probably is, by its name: a command before a position.
+
+    Args:
+        name: Its name.
+        unit: Its unit, which decides if the name says nothing.
+    """
     word = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
     word = re.sub(r"\d+", "_", word)
     for role, pattern in _ROLES:
         if pattern.search(word):
-            return role
-    return "other"
+            return "velocity" if role == "position" and unit in _RATES else role
+    return _ROLES_OF_UNITS.get(unit, "other")
 
 
 def plain_names(signals: Sequence[str]) -> list[str]:

@@ -220,6 +220,7 @@ def test_a_log_needs_a_mapping(tmp_path):
         (["Time (ms)", "x"], "Time (ms)"),
         (["time_us", "x"], "time_us"),
         (["TS_ms", "x"], "TS_ms"),
+        (["Ts", "x"], None),
         (["/a/header/stamp", "x"], "/a/header/stamp"),
         (["/a/header/stamp", "/b/header/stamp"], None),
         (["x", "T"], "T"),

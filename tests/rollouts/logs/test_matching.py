@@ -137,3 +137,18 @@ def test_a_position_matches_a_name_that_does_not_say_what_it_measures():
         "x": ("mocap_x", "its name does not say what it measures"),
         "pitch": ("mocap_pitch_deg", ""),
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "role"),
+    [
+        ("Z_mm", "mm", "position"),
+        ("J1_dps", "deg/s", "velocity"),
+        ("J1_deg", "deg/s", "velocity"),
+        ("cmd_Z_mm", "mm", "command"),
+        ("tracking_error_mm", "mm", "other"),
+        ("distance", "m", "other"),
+    ],
+)
+def test_a_unit_tells_what_a_name_does_not(name, unit, role):
+    assert role_of(name, unit) == role

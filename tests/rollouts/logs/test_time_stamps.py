@@ -71,12 +71,3 @@ def test_a_log_of_few_or_impossible_stamps_is_described(time):
 )  # fmt: skip
 def test_units_of_time_are_known_in_words(text, unit):
     assert time_unit_of(text) == unit
-
-
-@pytest.mark.parametrize(
-    ("name", "role"), [("Z_mm", "position"), ("J1_dps", "velocity"), ("cmd_Z_mm", "command")]
-)
-def test_a_unit_tells_what_a_name_does_not(name, role):
-    frame = pd.DataFrame({"t": 0.1 * np.arange(5), name: np.arange(5.0)})
-    (timing,) = described(read_frame_log(frame, LogSettings())).timings
-    assert [signal.role for signal in timing.signals] == [role]

@@ -77,7 +77,8 @@ def is_time_name(name: str) -> bool:
 
 def time_name(names: Iterable[str]) -> str | None:
     """Returns the name that most likely belongs to the time stamps of all columns."""
-    found = [(name, _split(name)[0]) for name in names]
+    # ``Ts`` usually is a sampling period.
+    found = [(name, _split(name)[0]) for name in names if name.strip() != "Ts"]
     for wanted in _NAMES:
         for name, word in found:
             if word == wanted:
