@@ -108,6 +108,20 @@ class Own(Bias):
         return parameters["offset"] * float(position)
 
 
+def test_a_refused_law_does_not_decide_where_dry_friction_goes(tmp_path):
+    """Beside a law that reads accelerations, simulations apply dry friction themselves."""
+
+    class OwnWithJoint(Own):
+        needs_joint = True
+
+    own, dry = OwnWithJoint("shoulder_torque"), CoulombFriction("elbow_torque")
+    simulator = MujocoSimulator(write_arm(tmp_path, "Euler")).with_effects(own, dry)
+    given = {f"{own.name}.offset": value(0.1), f"{dry.name}.magnitude": value(0.2)}
+    found = export_mjcf(simulator, given)
+    assert set(found.refused) == {own.name} and found.callbacks is None
+    assert found.text.count('frictionloss="0.2"') == 1
+
+
 EFFECTS = [
     (CoulombFriction("elbow_torque"), {"magnitude": 0.2}),
     (ViscousFriction("elbow_torque"), {"damping": 0.2}),

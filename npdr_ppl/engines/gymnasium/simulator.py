@@ -63,9 +63,9 @@ class GymnasiumSimulator(SteppedSimulator):
         sensors: Channels that are measured after each step. ``None`` for the states, or, if there
             are no states, the entries of the observation, ``observation_0`` and so on.
         read: Maps the environment and an observation to the measurements ``(sensors,)``; or the
-            path of an attribute. ``None`` uses the attribute of the state if all sensors are
-            states, and the observation otherwise. Before the first step, the observation is that
-            of the reset and does not show the state that was set.
+            path of an attribute. ``None`` uses the attribute of the state if ``set_state`` is a
+            path and no sensors are given, and the observation otherwise. Before the first step,
+            the observation is that of the reset and does not show the state that was set.
         actions: Names and units of the commands; ``None`` for ``action_0`` and so on. If the
             action space is a box, the commands have its limits.
         act: Maps the environment and commands ``(actions,)`` to an action of the environment;
