@@ -37,9 +37,9 @@ PORTS = {
 # a scene does not have.
 REFUSED = {
     "backlash", "base_compliance", "clock_skew", "contact", "joint_elasticity",
-    "load_dependent_friction", "payload", "presliding_friction", "sensor_delay", "servo_gain",
-    "servo_force_limit", "servo_dead_band", "servo_integral_action", "goal_speed_limit",
-    "goal_acceleration_limit", "goal_resolution",
+    "load_dependent_friction", "offset_payload", "payload", "presliding_friction", "sensor_delay",
+    "servo_gain", "servo_force_limit", "servo_dead_band", "servo_integral_action",
+    "goal_speed_limit", "goal_acceleration_limit", "goal_resolution",
 }  # fmt: skip
 
 # Bullet works in float64 here and its Featherstone dynamics of one joint are the same formula.

@@ -8,6 +8,7 @@ import pytest
 from hidden_rigs import make_case
 
 import npdr_ppl as npdr
+from npdr_ppl.discovery.proof.surviving_causes import VERSION
 from npdr_ppl.errors import DataError
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.planning import plan_recording
@@ -197,7 +198,7 @@ def test_a_discovery_keeps_what_rebuilds_its_causes(ambiguous, surviving):
     known, _ = surviving
     record = json.loads((folder / "discovery.json").read_text())["surviving_causes"]
     assert [c.name for c in known.causes][0] == "hinge.coulomb_friction"
-    assert record["version"] == 1
+    assert record["version"] == VERSION
     assert known.causes[0].probability == pytest.approx(max(c.probability for c in known.causes))
     for cause in known.causes:
         assert (np.linalg.eigvalsh(cause.precision.numpy()) >= 1.0 - 1e-9).all()
