@@ -161,6 +161,8 @@ def test_alternatives_to_a_candidate_that_explains_very_much_start_where_it_does
         monkeypatch.setattr(convergence, "TRIALS", settings)
         return converge_along_best(searcher.trials, tried, base)
 
+    late = converge_along_best(searcher.trials, tried, base, stops=lambda: True)
+    assert all(late[name] is trial for name, trial in tried.items())
     before, after = with_enough(1.1 * evidence), with_enough(0.9 * evidence)
     assert set(before) == set(tried)
     assert list(after) == ["hinge.quadratic_drag", "hinge.viscous_friction"]

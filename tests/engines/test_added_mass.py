@@ -6,6 +6,8 @@ import pytest
 import torch
 
 import npdr_ppl as npdr
+from npdr_ppl.engines.mujoco.isaac_lab import isaac_lab_file
+from npdr_ppl.engines.mujoco.randomised import randomised_fields
 from npdr_ppl.language.reference import quantile
 from npdr_ppl.models.effects import OffsetPayload, Payload, candidate_effects
 from tests.helpers.mujoco_files import random_inputs, value
@@ -104,3 +106,15 @@ def test_a_load_can_be_anywhere_on_a_large_body(joint: str, least: float) -> Non
       </body></worldbody></mujoco>"""
     port = npdr.MujocoSimulator(mujoco.MjModel.from_xml_string(text)).port("payload")
     assert port.rated == 8.0 and port.rated_position > least
+
+
+def test_isaac_lab_is_said_to_lack_the_inertia_of_a_load() -> None:
+    """It only scales inertia with the mass."""
+    effect = OffsetPayload("payload")
+    values = {"mass": [0.1, 0.2], "x": [0.1, 0.12]}
+    draws = {f"{effect.name}.{name}": value(numbers) for name, numbers in values.items()}
+    loaded = arm().with_effects(effect)
+    found = randomised_fields(loaded, draws)
+    text, refused = isaac_lab_file(loaded.model, found, module="events", robot="arm.xml")
+    assert "randomize_rigid_body_com" in text
+    assert list(refused) == ["inertia of hand"]

@@ -11,6 +11,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.settings import INTERVALS
 from npdr_ppl.inference.parts.samplers.importance_weights import systematic
 from npdr_ppl.preparation.importance_sampling import laplace_draws, sample_posterior
+from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
 from npdr_ppl.randomness import derived_seed
 
 __all__ = ["Draws", "Estimate", "estimates", "posterior_draws", "quick_draws"]
@@ -109,7 +110,7 @@ def quick_draws(hypothesis: Hypothesis, *, seed: int) -> Draws:
     """
     own_seed = derived_seed(seed, "discovery", "posterior")
     z = laplace_draws(hypothesis.likelihood, INTERVALS.quick_draws, seed=own_seed)
-    if len(z) < INTERVALS.fewest_quick:
+    if len(z) < IMPORTANCE_SAMPLING.enough_effective:
         return posterior_draws(hypothesis, seed=seed, is_rough=True)
     return Draws(z, torch.full((len(z),), 1.0 / len(z), dtype=torch.float64))
 

@@ -84,8 +84,6 @@ class IntervalSettings:
         rough_iterations: Greatest number of proposals for draws of a model that lacks effects,
             whose weights need not be reliable because the model is wrong.
         quick_draws: Number of draws of Laplace's approximation, where no time may be taken.
-        fewest_quick: Fewest of them in the prior's support, as many as a posterior's effective
-            ones.
     """
 
     copies: int = 16
@@ -93,12 +91,11 @@ class IntervalSettings:
     mass: float = 0.94
     rough_iterations: int = 2
     quick_draws: int = 1024
-    fewest_quick: int = 200
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, 1000, "copies", "rough_iterations")
-        check_range(self, 1, math.inf, "quick_draws", "fewest_quick")
+        check_range(self, 1, math.inf, "quick_draws")
         check_range(self, 0.0, 1.0, "bandwidth", "mass")
 
 

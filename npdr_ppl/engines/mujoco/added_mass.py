@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
@@ -43,7 +44,7 @@ def with_point_mass(
     centre, inertia = numbers("body_ipos", 3), numbers("body_inertia", 3)
     turn = numbers("body_iquat", 4)
     moved = centre + share[..., None] * distance
-    axes = _rotation(turn)
+    axes = _matrices(turn)
     along = (axes.mT @ distance[..., None])[..., 0]
     square = (along * along).sum(-1)[..., None, None] * torch.eye(3, dtype=torch.float64)
     reduced = (mass * share)[..., None, None]
@@ -56,7 +57,7 @@ def with_point_mass(
     vectors = vectors * torch.linalg.det(vectors).sign()[..., None, None]
     is_same = (more == 0.0).all(-1).all(-1)[..., None]
     inertia = torch.where(is_same, inertia, values)
-    turn = torch.where(is_same, turn, _quaternion(axes @ vectors))
+    turn = torch.where(is_same, turn, _quaternions(axes @ vectors))
     result = dict(assignments)
     result["body_mass", body] = total
     rows = (("body_ipos", moved), ("body_inertia", inertia), ("body_iquat", turn))
@@ -66,41 +67,12 @@ def with_point_mass(
     return result
 
 
-def _rotation(quaternion: Tensor) -> Tensor:
-    """Returns rotation matrices, ``(..., 3, 3)``, of unit quaternions, ``(..., 4)``."""
-    w, x, y, z = quaternion.unbind(-1)
-    rows = (
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+def _matrices(quaternions: Tensor) -> Tensor:
+    """Returns the rotation matrices, ``(..., 3, 3)``, of MuJoCo's quaternions, ``(..., 4)``."""
+    w_last = quaternions.numpy()[..., [1, 2, 3, 0]]
+    return torch.from_numpy(Rotation.from_quat(w_last).as_matrix())
 
 
-def _quaternion(rotation: Tensor) -> Tensor:
-    """Returns unit quaternions of rotation matrices.
-
-    Each row of 4 q qᵀ is the quaternion times a number; the longest row is the most exact.
-    """
-    r = rotation
-    xx, yy, zz = (r[..., i, i] for i in range(3))
-    wx, wy, wz = (
-        r[..., 2, 1] - r[..., 1, 2],
-        r[..., 0, 2] - r[..., 2, 0],
-        r[..., 1, 0] - r[..., 0, 1],
-    )
-    xy, xz, yz = (
-        r[..., 0, 1] + r[..., 1, 0],
-        r[..., 0, 2] + r[..., 2, 0],
-        r[..., 1, 2] + r[..., 2, 1],
-    )
-    rows = (
-        (1.0 + xx + yy + zz, wx, wy, wz),
-        (wx, 1.0 + xx - yy - zz, xy, xz),
-        (wy, xy, 1.0 - xx + yy - zz, yz),
-        (wz, xz, yz, 1.0 - xx - yy + zz),
-    )
-    squares = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    longest = squares.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    chosen = torch.take_along_dim(squares, longest[..., None, None], dim=-2)[..., 0, :]
-    return chosen / chosen.norm(dim=-1, keepdim=True)
+def _quaternions(matrices: Tensor) -> Tensor:
+    """Returns the quaternions, ``(..., 4)``, of rotation matrices."""
+    return torch.from_numpy(Rotation.from_matrix(matrices.numpy()).as_quat()[..., [3, 0, 1, 2]])

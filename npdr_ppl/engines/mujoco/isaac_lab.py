@@ -101,9 +101,10 @@ def isaac_lab_file(
                 terms[f"body_{body}_material"] = _material(model, body, columns)
         elif array == "gravity":
             terms["gravity"] = _gravity(model, columns)
-        elif array == "body_iquat" or ("body_iquat", kind, name, 0) in columns:
-            if array == "body_inertia":
-                refused[f"inertia of {name}"] = "Isaac Lab has no event that turns it"
+        elif array == "body_iquat":
+            refused[f"inertia of {name}"] = (
+                "Isaac Lab scales it with the mass, but a load away from the centre also turns it"
+            )
         elif array == "body_inertia" and ("body_mass", kind, name, 0) in columns:
             continue  # it follows the mass
         elif array not in _GAINS:
