@@ -41,7 +41,8 @@ LOCK = ".lock"
 
 IN_WORDS = {
     "binding": "how the data are prepared",
-    "fingerprint": "the data or what is read from them",
+    "features": "what is read from the data or the model",
+    "fingerprint": "the data",
     "model": "the model's source",
     "num_simulations": "the number of simulations",
     "num_steps": "the number of steps",
@@ -50,6 +51,10 @@ IN_WORDS = {
 
 MAX_WHOLE_NUMBER = 2**63
 """Largest absolute whole number in a file; seeds have at most 63 bits."""
+
+ROUNDING = 1e-6
+"""Difference up to which computed values of a run's description are the same. It is far above
+rounding errors and far below what other data or another model change."""
 
 _CHECKSUM = "sha256"
 
@@ -150,8 +155,17 @@ def _differing(present: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterato
         known = present.get(key)
         if key == "options" and isinstance(known, Mapping):
             yield from (k for k in {**known, **value} if known.get(k) != value.get(k))
-        elif known != value:
+        elif not _is_same(known, value):
             yield key
+
+
+def _is_same(known: Any, value: Any) -> bool:
+    """Returns whether values are equal; computed ones, lists of floats, up to rounding."""
+    if isinstance(known, list) and isinstance(value, list) and len(known) == len(value):
+        pairs = list(zip(known, value, strict=True))
+        if all(isinstance(one, float) and isinstance(other, float) for one, other in pairs):
+            return all(math.isclose(*pair, rel_tol=ROUNDING, abs_tol=ROUNDING) for pair in pairs)
+    return bool(known == value)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -192,3 +192,13 @@ def test_names_in_an_edited_description_are_printable(tmp_path):
     with pytest.raises(DataError, match=r"differs in .\\u202ebc+…;") as raised:
         holds_this_run(tmp_path / "run.json", description)
     assert str(raised.value).isprintable()
+
+
+def test_computed_values_may_differ_by_rounding(tmp_path):
+    write_json(tmp_path / "run.json", {"features": [0.25, -3.0], "length": 0.25})
+    (tmp_path / "result.json").touch()
+    file = tmp_path / "run.json"
+    assert holds_this_run(file, {"features": [0.25 + 1e-9, -3.0 - 1e-6], "length": 0.25})
+    for other in ({"features": [0.26, -3.0]}, {"features": [0.25]}, {"length": 0.25 + 1e-9}):
+        with pytest.raises(DataError, match="differs in"):
+            holds_this_run(file, other)

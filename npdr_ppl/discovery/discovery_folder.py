@@ -14,7 +14,6 @@ reads its fits instead of repeating them. A complete one is not repeated.
 """
 
 import dataclasses
-import hashlib
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +29,7 @@ from npdr_ppl.language.model import Model
 from npdr_ppl.model_identity import model_name, source_text, versions
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.collection import checksum
 from npdr_ppl.run_files import holds_this_run, make_folder, plain, read_json, write_json
 from npdr_ppl.run_records import DiscoveryRecord
 
@@ -92,7 +92,7 @@ class DiscoveryFolder:
                 },
                 "options": settings,
                 "seed": seed,
-                "recordings": [_checksum(r) for r in (rollouts, holdout) if r is not None],
+                "recordings": [checksum(r) for r in (rollouts, holdout) if r is not None],
             }
         )
         file = self.path / "run.json"
@@ -160,15 +160,3 @@ def findings_until(
         ]
     investigation.progress.finish()
     return found | {"seconds": investigation.seconds}, None
-
-
-def _checksum(rollouts: Rollouts) -> str:
-    digest = hashlib.sha256(repr((rollouts.channel_names, rollouts.time_step)).encode())
-    for readings, actions in zip(rollouts.readings, rollouts.actions, strict=True):
-        digest.update(readings.tobytes())
-        digest.update(actions.tobytes())
-    digest.update(repr(rollouts.spans).encode())
-    for sampling in rollouts.samplings:
-        for part in (sampling.values, sampling.lateness, sampling.is_read):
-            digest.update(part.tobytes())
-    return digest.hexdigest()

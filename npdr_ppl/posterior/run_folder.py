@@ -15,6 +15,7 @@ Every file replaces its predecessor in one step, so a run killed at any moment l
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ from npdr_ppl.posterior.prepare import Preparation
 from npdr_ppl.preparation.binding import BoundModel
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.rollouts import Rollouts
+from npdr_ppl.rollouts.collection import checksum
 from npdr_ppl.run_files import (
     holds_this_run,
     load_tensors,
@@ -51,6 +53,9 @@ from npdr_ppl.run_records import PreparationRecord, RoundRecord, RunDescription
 __all__ = ["RunFolder", "SavedPreparation", "SavedRound"]
 
 FORMAT = 1
+
+SKETCHED = 4
+"""Number of random projections by which features are recognised."""
 
 MAX_FINER_STEPS = 20
 """Largest number of times that integration steps are halved; the search stops long before."""
@@ -116,7 +121,8 @@ class RunFolder:
             "binding": _binding(bound),
             "seed": seed,
             "num_simulations": num_simulations,
-            "fingerprint": _fingerprint(bound.observed_features()),
+            "fingerprint": _fingerprint(bound.data),
+            "features": _sketch(bound.observed_features()),
         }
         file = self.path / "run.json"
         if holds_this_run(file, description):
@@ -243,7 +249,8 @@ class RunFolder:
         if not file.exists():
             return None
         saved = load_tensors(file, "z", "x")
-        return saved["x"] if torch.equal(saved["z"], z.cpu()) else None
+        is_same = saved["z"].shape == z.shape and torch.allclose(saved["z"], z.cpu(), 1e-6, 1e-6)
+        return saved["x"] if is_same else None
 
     def description(self) -> RunDescription:
         """Returns what :meth:`begin` wrote.
@@ -278,6 +285,25 @@ def _binding(bound: BoundModel) -> dict[str, Any]:
     return values
 
 
-def _fingerprint(tensor: Tensor) -> str:
-    values = tensor.detach().cpu().double().contiguous().numpy()
-    return hashlib.sha256(values.tobytes()).hexdigest()
+def _fingerprint(data: Mapping[str, Rollouts | Tensor]) -> str:
+    """Returns a SHA-256 of all measured data."""
+    digest = hashlib.sha256()
+    for name, value in sorted(data.items()):
+        digest.update(name.encode())
+        if isinstance(value, Rollouts):
+            digest.update(checksum(value).encode())
+        else:
+            values = torch.as_tensor(value).detach().cpu().double().contiguous()
+            digest.update(values.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _sketch(features: Tensor) -> list[float]:
+    """Returns projections of features on random directions, by which others are recognised.
+
+    Features can be derived from a fit, so they are compared up to rounding, not by a checksum.
+    """
+    flat = features.detach().cpu().double().flatten()
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(SKETCHED, len(flat), generator=generator, dtype=torch.float64)
+    return (directions @ flat / math.sqrt(len(flat))).tolist()

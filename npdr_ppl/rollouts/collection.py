@@ -17,6 +17,7 @@ from npdr_ppl.rollouts.recording import Recording
 
 __all__ = [
     "are_equal",
+    "checksum",
     "joined",
     "picked",
     "pieces",
@@ -165,6 +166,19 @@ def without_duplicates(rollouts: Episodes) -> Episodes:
     if not notes:
         return rollouts
     return replace(rollouts, stretches=tuple(spans), notes=(*rollouts.notes, *notes))
+
+
+def checksum(rollouts: Recording) -> str:
+    """Returns a SHA-256 of all that rollouts hold, as hexadecimal digits."""
+    digest = hashlib.sha256(repr((rollouts.channel_names, rollouts.time_step)).encode())
+    for readings, actions in zip(rollouts.readings, rollouts.actions, strict=True):
+        digest.update(readings.tobytes())
+        digest.update(actions.tobytes())
+    digest.update(repr(rollouts.spans).encode())
+    for sampling in rollouts.samplings:
+        for part in (sampling.values, sampling.lateness, sampling.is_read):
+            digest.update(part.tobytes())
+    return digest.hexdigest()
 
 
 def are_equal(one: Recording, other: Recording) -> bool:

@@ -11,6 +11,7 @@ import npdr_ppl as npdr
 from npdr_ppl.errors import BackendError, DataError, ModelError, ShapeError
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.posterior import infer as infer_module
+from npdr_ppl.preparation.binding import BoundModel
 
 
 @pytest.mark.slow
@@ -82,6 +83,24 @@ def test_an_interrupted_run_continues_to_the_same_result(linear, quick, tmp_path
     )
     with pytest.raises(DataError, match="differs in seed"):
         npdr.infer(model, observed, checkpoint=tmp_path, **{**arguments, "seed": 9})
+
+
+def test_a_run_continues_only_with_its_own_data(linear, quick, tmp_path, monkeypatch):
+    model, observed = linear
+    arguments = {"backend": quick, "num_simulations": 80, "checkpoint": tmp_path}
+    first = npdr.infer(model, observed, **arguments).sample(10)["theta"]
+    with pytest.raises(DataError, match="differs in the data"):
+        npdr.infer(model, observed + 1e-6, **arguments)
+    real = BoundModel.observed_features
+    for factor, sentence in ((1.0 + 1e-8, None), (1.01, "differs in what is read from the data")):
+        monkeypatch.setattr(
+            BoundModel, "observed_features", lambda bound, by=factor: by * real(bound)
+        )
+        if sentence is None:
+            assert torch.equal(npdr.infer(model, observed, **arguments).sample(10)["theta"], first)
+        else:
+            with pytest.raises(DataError, match=sentence):
+                npdr.infer(model, observed, **arguments)
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def provenance_section(description: Mapping[str, Any], folder: Path) -> Section:
     versions = description.get("versions") or {}
     rows += [[f"version of {name}", str(value)] for name, value in versions.items()]
     if fingerprint := description.get("fingerprint"):
-        rows.append(["SHA-256 of the features of the data", str(fingerprint)])
+        rows.append(["SHA-256 of the data", str(fingerprint)])
     rows += [[f"SHA-256 of {f.relative_to(folder)}", checksum(f)] for f in data_files(folder)]
     if not rows:
         parts = [TextPart("The run did not record its origin.")]
