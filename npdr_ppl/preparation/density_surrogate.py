@@ -22,7 +22,8 @@ class DensitySurrogate:
     Attributes:
         mean: Mean of the density, ``(d,)``.
         factor: Cholesky factor of its covariance, ``(d, d)``.
-        polynomial: The log density of points that are standardised by both.
+        polynomial: By how much the log density exceeds that of a normal density with this mean
+            and covariance, of points that are standardised by both.
         farthest: Greatest distance from the mean, in standard deviations; the density is zero
             beyond.
     """
@@ -58,12 +59,12 @@ class DensitySurrogate:
         points = torch.linalg.solve_triangular(factor, away[near].mT, upper=False).mT
         polynomial = fit_polynomial(
             points,
-            log_density[near, None],
+            log_density[near, None] + 0.5 * points.square().sum(-1, keepdim=True),
             weights=1.0 / (1.0 + (excess[near] / d)),
             importance=torch.ones(1, dtype=torch.float64),
-            least_degree=2,  # a plane has no peak
             most_degree=DENSITY_SURROGATE.most_degree,
             points_per_coefficient=DENSITY_SURROGATE.points_per_coefficient,
+            penalties=DENSITY_SURROGATE.penalties,
         )
         if polynomial is None or polynomial.error > DENSITY_SURROGATE.largest_error:
             return None
@@ -72,5 +73,6 @@ class DensitySurrogate:
     def __call__(self, w: Tensor) -> Tensor:
         """Returns the log density up to a constant, ``(n,)``, at points ``(n, d)``."""
         points = torch.linalg.solve_triangular(self.factor, (w - self.mean).mT, upper=False).mT
-        is_near = points.norm(dim=-1) <= self.farthest
-        return torch.where(is_near, self.polynomial(points)[:, 0], -torch.inf)
+        squares = points.square().sum(-1)
+        value = self.polynomial(points)[:, 0] - 0.5 * squares
+        return torch.where(squares <= self.farthest**2, value, -torch.inf)

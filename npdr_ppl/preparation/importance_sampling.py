@@ -6,11 +6,13 @@ weights are too unequal, the next proposal is a kernel density estimate of the w
 which follows curved ridges. The tail of the weights, fitted by Pareto smoothing, shows whether
 they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 
-Along ridges, an ensemble of the draws then moves by Markov chain Monte Carlo, because importance
-sampling gives too little weight to their ends. A polynomial that is fitted to the draws leads it,
-so that few moves suffice; see :mod:`npdr_ppl.preparation.density_surrogate`. There are no moves if
-Laplace's approximation with its heavy tails suffices: the posterior is then nearly normal in these
-coordinates, and the tails reach its ends.
+Where the draws are many enough for a polynomial of the log density, it takes the place of the
+proposals: Markov chains draw from it without a simulation, and their ends are weighted by the
+ratio of the two densities; see :mod:`npdr_ppl.preparation.density_surrogate`. This reaches the
+ends of ridges, to which proposals give too few draws. If no polynomial is close enough, an
+ensemble of the draws moves along the ridges by Markov chain Monte Carlo under the density itself.
+Neither is needed if Laplace's approximation with its heavy tails suffices: the posterior is then
+nearly normal in these coordinates, and the tails reach its ends.
 """
 
 import math
@@ -23,7 +25,7 @@ from torch import Tensor
 from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
-from npdr_ppl.inference.parts.samplers.walkers import ensemble_draws
+from npdr_ppl.inference.parts.samplers.walkers import LogDensity, ensemble_draws
 from npdr_ppl.preparation.density_surrogate import DensitySurrogate
 from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
@@ -73,6 +75,14 @@ class WeightedDraws:
         return (
             self.k_hat <= IMPORTANCE_SAMPLING.reliable_k
             and self.effective >= IMPORTANCE_SAMPLING.least_effective
+        )
+
+    @property
+    def has_enough(self) -> bool:
+        """Whether no more draws are needed."""
+        return (
+            self.k_hat <= IMPORTANCE_SAMPLING.reliable_k
+            and self.effective >= IMPORTANCE_SAMPLING.enough_effective
         )
 
     def moments(self) -> tuple[Tensor, Tensor]:
@@ -183,7 +193,12 @@ def sample_posterior(
         size = size if math.isfinite(k_hat) else 0.0
         wanted = settings.enough_effective
         report(f"{len(z)} draws, {min(size, wanted):.0f} of {wanted:.0f} effective ones")
-        if result.k_hat <= settings.reliable_k and result.effective >= settings.enough_effective:
+        is_enough = result.has_enough
+        if is_enough and (not space.num_weak or (iteration == 0 and not given)):
+            break
+        if not is_rough and (led := _led(result, target, likelihood, seed)) is not None:
+            return led
+        if is_enough:
             break
         if iteration + 1 >= settings.iterations_to_adapt and size < z.shape[1]:
             break
@@ -216,6 +231,80 @@ def laplace_draws(likelihood: SegmentLikelihood, num: int, *, seed: int) -> Tens
     return z[inside]
 
 
+def _log_density(likelihood: SegmentLikelihood, space: RidgeCoordinates) -> LogDensity:
+    """Returns the posterior's log density over the coordinates w, up to a constant."""
+    prior = likelihood.segments.prior
+
+    def log_density(w: Tensor) -> Tensor:
+        z, inside = space.to_reference(w)
+        result = torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        if bool(inside.any()):
+            at = z[inside]
+            result[inside] = likelihood.log_prob(at) + prior.log_prob(at) - space.log_jacobian(at)
+        return result.nan_to_num(-math.inf, -math.inf, -math.inf)
+
+    return log_density
+
+
+def _known(draws: WeightedDraws, target: Tensor) -> Tensor:
+    """Returns the log density of draws over w, ``(n,)``, from that over reference coordinates."""
+    return torch.where(target.isfinite(), target - draws.space.log_jacobian(draws.z), -torch.inf)
+
+
+def _led(
+    draws: WeightedDraws, target: Tensor, likelihood: SegmentLikelihood, seed: int
+) -> WeightedDraws | None:
+    """Returns draws of a polynomial in place of the log density, weighted by their ratio.
+
+    The polynomial is fitted to the draws so far, and again to its own draws where it was wrong.
+
+    Args:
+        draws: The draws so far.
+        target: Their log density over reference coordinates, ``(n,)``.
+        likelihood: The recording's likelihood.
+        seed: Seed of the draws.
+
+    Returns:
+        ``None`` if there is no polynomial, or its draws are too few effective ones.
+    """
+    settings, space = IMPORTANCE_SAMPLING, draws.space
+    log_density = _log_density(likelihood, space)
+    w, log_weights, known = draws.w, draws.log_weights, _known(draws, target)
+    for attempt in range(settings.polynomials):
+        surrogate = DensitySurrogate.of(w, log_weights, known)
+        if surrogate is None:
+            return None
+
+        def density(at: Tensor, polynomial: DensitySurrogate = surrogate) -> Tensor:
+            return torch.where(space.to_reference(at)[1], polynomial(at), -torch.inf)
+
+        with seeded(seed, "led", attempt):
+            first = w[systematic(log_weights, settings.num_walkers)]
+        made = ensemble_draws(
+            density,
+            first,
+            sweeps=settings.sweeps_led,
+            interval=settings.sweeps_led // 4,
+            generator=torch.Generator().manual_seed(derived_seed(seed, "led", attempt)),
+        )
+        values = log_density(made)
+        smoothed, k_hat = smoothed_weights(values - density(made))
+        found = WeightedDraws(
+            space.to_reference(made)[0],
+            made,
+            space,
+            smoothed,
+            k_hat,
+            effective_size(smoothed),
+            draws.iterations,
+        )
+        if found.has_enough:
+            return found
+        w, known = torch.cat((w, made)), torch.cat((known, values))
+        log_weights = torch.cat((log_weights, torch.full_like(smoothed, -torch.inf)))
+    return None
+
+
 def _moved(
     draws: WeightedDraws, target: Tensor, likelihood: SegmentLikelihood, seed: int
 ) -> WeightedDraws:
@@ -229,31 +318,20 @@ def _moved(
         likelihood: The recording's likelihood.
         seed: Seed of the moves.
     """
-    settings, space, prior = IMPORTANCE_SAMPLING, draws.space, likelihood.segments.prior
-
-    def log_density(w: Tensor) -> Tensor:
-        z, inside = space.to_reference(w)
-        result = torch.full((len(w),), -torch.inf, dtype=torch.float64)
-        if bool(inside.any()):
-            at = z[inside]
-            result[inside] = likelihood.log_prob(at) + prior.log_prob(at) - space.log_jacobian(at)
-        return result.nan_to_num(-math.inf, -math.inf, -math.inf)
-
-    known = torch.where(target.isfinite(), target - space.log_jacobian(draws.z), -torch.inf)
-    surrogate = DensitySurrogate.of(draws.w, draws.log_weights, known)
+    settings = IMPORTANCE_SAMPLING
+    surrogate = DensitySurrogate.of(draws.w, draws.log_weights, _known(draws, target))
     with seeded(seed, "walkers"):
         first = draws.w[systematic(draws.log_weights, settings.num_walkers)]
-    generator = torch.Generator().manual_seed(derived_seed(seed, "ensemble"))
     w = ensemble_draws(
-        log_density,
+        _log_density(likelihood, draws.space),
         first,
         sweeps=settings.sweeps if surrogate else settings.sweeps_alone,
         interval=settings.sweeps_between_draws,
-        generator=generator,
+        generator=torch.Generator().manual_seed(derived_seed(seed, "ensemble")),
         surrogate=surrogate,
     )
     log_weights = torch.full((len(w),), -math.log(len(w)), dtype=torch.float64)
-    return replace(draws, z=space.to_reference(w)[0], w=w, log_weights=log_weights)
+    return replace(draws, z=draws.space.to_reference(w)[0], w=w, log_weights=log_weights)
 
 
 def smoothed_weights(log_weights: Tensor) -> tuple[Tensor, float]:

@@ -1,6 +1,7 @@
 """Polynomials in several variables, fitted by weighted least squares."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -43,6 +44,7 @@ def fit_polynomial(
     most_degree: int,
     least_degree: int = 1,
     points_per_coefficient: int,
+    penalties: Sequence[float] = (0.0,),
 ) -> Polynomial | None:
     """Returns the polynomial with the smallest leave-one-out error.
 
@@ -54,23 +56,33 @@ def fit_polynomial(
         most_degree: Greatest degree.
         least_degree: Least degree.
         points_per_coefficient: Least number of points for each coefficient.
+        penalties: Penalties of squared coefficients, per point, of which the best is taken (ridge
+            regression). The constant is not penalised.
 
     Returns:
         ``None`` if there are too few points, or no degree can be fitted.
     """
     found, least = None, torch.inf
     weight = weights[:, None]
-    wanted = weight * values
+    middle = (weight.square() * values).sum(0) / weight.square().sum()
+    wanted = weight * (values - middle)
     for degree in range(least_degree, most_degree + 1):
         if points_per_coefficient * num_terms(points.shape[1], degree) > len(points):
             break
-        q, r = torch.linalg.qr(weight * _monomials(points, degree))
-        leverage = q.square().sum(-1, keepdim=True).clamp(max=0.999)
-        left_out = (wanted - q @ (q.mT @ wanted)) / (1.0 - leverage)
-        error = float((left_out.square() @ importance).mean())
-        coefficients = torch.linalg.solve_triangular(r, q.mT @ wanted, upper=True)
-        if error < least and bool(coefficients.isfinite().all()):
-            least, found = error, Polynomial(coefficients, degree, error**0.5)
+        left, sizes, right = torch.linalg.svd(
+            weight * _monomials(points, degree), full_matrices=False
+        )
+        projected = left.mT @ wanted
+        for penalty in penalties:
+            inverse = sizes / (sizes.square() + penalty * len(points))
+            kept = inverse * sizes
+            leverage = (left.square() @ kept)[:, None].clamp(max=0.999)
+            left_out = (wanted - left @ (kept[:, None] * projected)) / (1.0 - leverage)
+            error = float((left_out.square() @ importance).mean())
+            coefficients = right.mT @ (inverse[:, None] * projected)
+            coefficients[0] += middle
+            if error < least and bool(coefficients.isfinite().all()):
+                least, found = error, Polynomial(coefficients, degree, error**0.5)
     return found
 
 

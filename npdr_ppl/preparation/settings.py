@@ -306,7 +306,10 @@ class ImportanceSamplingSettings:
             (Vehtari et al. 2024).
         enough_effective: Effective sample size at which sampling ends. The ends of a 90 % interval
             are then known to a tenth of a standard deviation.
-        num_walkers: Number of draws that then move along a ridge as an ensemble.
+        polynomials: Number of times that a polynomial is fitted in place of the log density.
+        sweeps_led: Number of moves of each walker under the polynomial, which cost no simulation.
+        num_walkers: Number of draws that move as an ensemble, under the polynomial or along a
+            ridge.
         sweeps: Number of moves of each; a surrogate leads most of them. On one Furuta pendulum
             (seed 1075 of ``benchmarks/discovery.py``), standard deviations after 8 were 2 %
             smaller than after 60.
@@ -327,6 +330,8 @@ class ImportanceSamplingSettings:
     iterations_to_adapt: int = 8
     reliable_k: float = 0.7
     enough_effective: float = 200.0
+    polynomials: int = 2
+    sweeps_led: int = 200
     num_walkers: int = 256
     sweeps: int = 8
     sweeps_alone: int = 30
@@ -342,6 +347,7 @@ class ImportanceSamplingSettings:
         check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
         check_range(self, 1, math.inf, "iterations_to_adapt")
         check_range(self, 1, math.inf, "sweeps", "sweeps_alone", "sweeps_between_draws")
+        check_range(self, 1, math.inf, "polynomials", "sweeps_led")
         check_range(self, 4, math.inf, "num_walkers")
         check_range(self, 1, math.inf, "enough_effective", "least_effective", "draws_of_given")
         check_range(self, 0.0, 1.0, "reliable_k")
@@ -358,18 +364,21 @@ class DensitySurrogateSettings:
             the number of parameters. It leaves out hardly any draw of a normal density.
         most_degree: Greatest degree of the polynomial.
         points_per_coefficient: Least number of points for each coefficient.
+        penalties: Penalties of squared coefficients, per point, of which the one with the smallest
+            leave-one-out error is taken: with few points, the density is nearly normal.
         largest_error: Greatest error of the polynomial in log density. With this error, half of
             the moves that it leads are accepted.
     """
 
     deepest: float = 10.0
     most_degree: int = 4
-    points_per_coefficient: int = 3
+    points_per_coefficient: int = 1
+    penalties: tuple[float, ...] = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
     largest_error: float = 1.0
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 0.0, math.inf, "deepest", "largest_error")
+        check_range(self, 0.0, math.inf, "deepest", "largest_error", "penalties")
         check_range(self, 1, 10, "most_degree")
         check_range(self, 1, math.inf, "points_per_coefficient")
 

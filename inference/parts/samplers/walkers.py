@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["ensemble_draws"]
+__all__ = ["LogDensity", "ensemble_draws"]
 
 STRETCH = 2.0
 """Greatest factor of a stretch; its inverse is the smallest (Goodman & Weare 2010)."""
