@@ -90,7 +90,7 @@ def columns_of_model(word: str) -> "list[Column]":
         simulator: Simulator = MujocoSimulator(Path(word))
     else:
         simulator = only_simulator(resolve_model(word))[0].simulator
-    return columns_of(simulator.sensors, simulator.actions)
+    return columns_of(simulator.sensors, simulator.actions, simulator.followers)
 
 
 def resolve_effects(model: Model, words: Sequence[str]) -> Callable[..., Any]:

@@ -30,7 +30,7 @@ from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.segment_model import SegmentModel, has_closest_fit
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.collection import with_commands, without_duplicates
+from npdr_ppl.rollouts.collection import with_commands, with_followers, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
 from npdr_ppl.rollouts.notes import faults_among
 from npdr_ppl.rollouts.simulator_checks import limited_commands
@@ -155,8 +155,9 @@ def _refuse_if_strict(rollouts: Rollouts, options: DataOptions) -> None:
 def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollouts:
     """Returns a recording without faults that are visible without a simulation."""
     rollouts = without_duplicates(with_commands(rollouts, simulator.actions))
+    rollouts = with_followers(rollouts, simulator.followers)
     rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
-    measured = [s for s in simulator.sensors if s.name in rollouts.channel_names]
+    measured = [s for s in simulator.sensors if s.name in rollouts.measured_names]
     if not measured:
         names = ", ".join(sensor.name for sensor in simulator.sensors)
         raise DataError(

@@ -7,7 +7,7 @@ from typing import Literal
 
 from npdr_ppl.errors import ModelError
 
-__all__ = ["Channel", "Parameter", "Port", "PortKind"]
+__all__ = ["Channel", "Follower", "Parameter", "Port", "PortKind"]
 
 PortKind = Literal["force", "action", "servo", "sensor", "environment", "clock", "parameter"]
 
@@ -32,6 +32,21 @@ class Channel:
     lower: float = -math.inf
     upper: float = math.inf
     rate_of: str | None = None
+
+
+@dataclass(frozen=True)
+class Follower:
+    """A position that follows from another one, such as that of the second finger of a gripper.
+
+    Attributes:
+        name: The state that follows.
+        leader: The state it follows from.
+        coefficients: Coefficients of the polynomial of the leader that it is, the constant first.
+    """
+
+    name: str
+    leader: str
+    coefficients: tuple[float, ...]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
-from npdr_ppl.language.channels import Channel, Parameter, Port, find_port
+from npdr_ppl.language.channels import Channel, Follower, Parameter, Port, find_port
 from npdr_ppl.language.effects import ComplianceEffect, Effect, ParameterEffect, ServoEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import InverseDynamics
@@ -169,6 +169,11 @@ class Simulator(ABC):
     def is_rate(self) -> tuple[bool, ...]:
         """Whether each state is the rate of another; the others are positions."""
         return tuple(state.rate_of is not None for state in self.states)
+
+    @property
+    def followers(self) -> tuple[Follower, ...]:
+        """Positions that need not be recorded, because they follow from others."""
+        return ()
 
     @property
     def all_ports(self) -> tuple[Port, ...]:

@@ -281,7 +281,7 @@ def _observe(
     simulator = box.simulator
     data.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     names = [sensor.name for sensor in simulator.sensors]
-    measured = [channel for channel in names if channel in data.channel_names]
+    measured = [channel for channel in names if channel in data.measured_names]
     if not measured:
         raise DataError(
             f"The data have none of the channels {', '.join(names)} that {simulator.name} "

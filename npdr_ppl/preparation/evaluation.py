@@ -70,7 +70,7 @@ def replay(
     if not isinstance(box, SimulatorBlackBox):
         raise DataError(f"Site {name!r} is a plain function and has no trajectory to replay.")
     names = [sensor.name for sensor in box.simulator.sensors]
-    measured = [channel for channel in names if channel in rollouts.channel_names]
+    measured = [channel for channel in names if channel in rollouts.measured_names]
     trajectory = prior.execute_at(parameters)[name][..., [names.index(c) for c in measured]]
     recorded = dict(zip(rollouts.channel_names, rollouts.channel_units, strict=True))
     units = tuple(

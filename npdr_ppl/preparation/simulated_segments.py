@@ -176,7 +176,7 @@ class SimulatedSegments:
             raise DataError(f"Site {self._site!r} is a plain function and has no trajectory.")
         rollouts, sensors = self.rollouts, box.simulator.sensors
         self.sensor_names = names = tuple(sensor.name for sensor in sensors)
-        self.measured = tuple(s for s in sensors if s.name in rollouts.channel_names)
+        self.measured = tuple(s for s in sensors if s.name in rollouts.measured_names)
         if not self.measured:
             raise DataError(
                 f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor "

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.channels import Channel, Follower
 from npdr_ppl.rollouts import segments
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
+from npdr_ppl.rollouts.sampling import Sampling
 
 __all__ = [
     "are_equal",
@@ -26,6 +27,7 @@ __all__ = [
     "summary",
     "with_channels",
     "with_commands",
+    "with_followers",
     "without_duplicates",
 ]
 
@@ -148,6 +150,41 @@ def with_commands(rollouts: Episodes, actions: Sequence[Channel]) -> Episodes:
         action_names=(*rollouts.action_names, *as_channels),
         action_units=(*rollouts.action_units, *(rollouts.channel_units[i] for i in columns)),
     )
+
+
+def with_followers(rollouts: Episodes, followers: Sequence[Follower]) -> Episodes:
+    """Returns rollouts with the positions that follow from recorded ones, not as measurements.
+
+    They say where a simulation begins, but it is not compared with them.
+
+    Args:
+        rollouts: The rollouts.
+        followers: Positions that follow from others.
+    """
+    while True:
+        names = rollouts.channel_names
+        new = [f for f in followers if f.name not in names and f.leader in names]
+        if not new:
+            return rollouts
+        follower = new[0]
+        column = names.index(follower.leader)
+        curve = np.polynomial.Polynomial(follower.coefficients)
+        values = [curve(readings[:, [column]]) for readings in rollouts.readings]
+        samplings = rollouts.samplings or [Sampling.at_rows(r) for r in rollouts.readings]
+        rollouts = replace(
+            rollouts,
+            readings=tuple(map(np.hstack, zip(rollouts.readings, values, strict=True))),
+            channel_names=(*names, follower.name),
+            channel_units=(*rollouts.channel_units, rollouts.channel_units[column]),
+            samplings=tuple(
+                sampling.with_unread(added)
+                for sampling, added in zip(samplings, values, strict=True)
+            ),
+            notes=(
+                *rollouts.notes,
+                f"{follower.name} was not recorded: it follows from {follower.leader}.",
+            ),
+        )
 
 
 def without_duplicates(rollouts: Episodes) -> Episodes:

@@ -162,6 +162,14 @@ class Recording:
         return motion_time(self.usable_readings, self.time_step)
 
     @property
+    def measured_names(self) -> tuple[str, ...]:
+        """Names of the channels of which at least one measurement was taken."""
+        if not self.samplings:
+            return self.channel_names
+        is_read = np.any([sampling.is_read.any(axis=0) for sampling in self.samplings], axis=0)
+        return tuple(n for n, read in zip(self.channel_names, is_read, strict=True) if read)
+
+    @property
     def spans(self) -> tuple[Spans, ...]:
         """First step and end of every usable stretch of each rollout."""
         return self.stretches or _whole(self.lengths)

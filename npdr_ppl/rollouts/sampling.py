@@ -98,6 +98,15 @@ class Sampling:
         chosen = list(columns)
         return Sampling(values[:, chosen], lateness[:, chosen], is_read[:, chosen])
 
+    def with_unread(self, values: Array) -> "Sampling":
+        """Returns the sampling with further channels ``(T + 1, k)`` that were not measured."""
+        shape = values.shape
+        return Sampling(
+            np.hstack((self.values, values)),
+            np.hstack((self.lateness, np.zeros(shape))),
+            np.hstack((self.is_read, np.zeros(shape, dtype=bool))),
+        )
+
 
 class Placed(NamedTuple):
     """One channel's measurements on T + 1 rows.

@@ -22,6 +22,7 @@ __all__ = [
     "actuator_names",
     "element_names",
     "find_field",
+    "follows_its_command",
     "joint_units",
     "servo_gains",
 ]
@@ -245,7 +246,10 @@ def actuated_joint(model: Any, actuator: int) -> int | None:
 
 
 def servo_gains(model: Any, actuator: int) -> tuple[str, ...]:
-    """Returns which gains an actuator has: kp and kv of position servos, kv of velocity servos."""
+    """Returns which gains an actuator has: kp and kv of position servos, kv of velocity servos.
+
+    The command of a position servo can have a unit of its own, such as 0 to 255 for a gripper.
+    """
     mujoco: Any = importlib.import_module("mujoco")
     is_fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
     is_affine = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -253,9 +257,16 @@ def servo_gains(model: Any, actuator: int) -> tuple[str, ...]:
     _, position, velocity = map(float, model.actuator_biasprm[actuator, :3])
     if not (is_fixed and is_affine and gain > 0.0):
         return ()
-    if position == -gain:
+    if position < 0.0:
         return ("kp", "kv") if velocity < 0.0 else ("kp",)
     return ("kv",) if position == 0.0 and velocity == -gain else ()
+
+
+def follows_its_command(model: Any, actuator: int) -> bool:
+    """Returns whether an actuator is a servo whose command has the unit of what it controls."""
+    gains = servo_gains(model, actuator)
+    gain, position = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, 1]
+    return bool(gains) and ("kp" not in gains or float(gain) == -float(position))
 
 
 def _joint_units_of(model: Any, kind: str, element: int) -> dict[str, str]:
@@ -271,17 +282,18 @@ def _joint_units_of(model: Any, kind: str, element: int) -> dict[str, str]:
 def _servo_entries(model: Any, actuator: int, gain: str, text: str) -> list[Entry]:
     """Returns the numbers that a gain of a servo sets.
 
-    The force of a position servo is kp (control − position) − kv velocity, so kp sets the gain and
-    minus the bias. That of a velocity servo is kv (control − velocity).
+    The force of a position servo is kp (s control − position) − kv velocity, so kp sets the gain,
+    s times itself, and minus the bias. That of a velocity servo is kv (control − velocity).
     """
     numbers, quantities = [], _QUANTITIES["actuator"]
     for name, component in (("kp", ""), ("bias", "position"), ("bias", "velocity")):
         numbers += _entries(model, "actuator", actuator, quantities[name], component)
     control, position, velocity = numbers
     minus_position, minus_velocity = position._replace(factor=-1.0), velocity._replace(factor=-1.0)
-    is_position_servo = control.nominal == -position.nominal != 0.0
+    is_position_servo = control.nominal > 0.0 > position.nominal
     if gain == "kp" and is_position_servo:
-        return [control, minus_position]
+        scale = control.nominal / -position.nominal
+        return [minus_position, control._replace(factor=scale)]
     if gain == "kv" and is_position_servo:
         return [minus_velocity]
     if gain == "kv" and position.nominal == 0.0 and control.nominal == -velocity.nominal:

@@ -17,7 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, servo_gains
+from npdr_ppl.engines.mujoco.fields import (
+    actuated_joint,
+    element_names,
+    follows_its_command,
+    servo_gains,
+)
 from npdr_ppl.engines.mujoco.randomised import Field, RandomisedFields
 from npdr_ppl.python_text import plain, quoted
 
@@ -211,7 +216,7 @@ def _joint_gains(model: Any, columns: Mapping[Field, Array], num: int) -> dict[s
     for actuator in range(model.nu):
         joint = actuated_joint(model, actuator)
         gains = servo_gains(model, actuator)
-        if joint is None or not gains:
+        if joint is None or not follows_its_command(model, actuator):
             continue
         name = model.actuator(actuator).name or actuator
         gear = drawn("actuator_gear", "actuator", actuator, 0, model.actuator_gear[actuator, 0])
@@ -246,7 +251,7 @@ def _undriven(model: Any, columns: Mapping[Field, Array]) -> dict[str, str]:
         if kind != "actuator" or array not in _GAINS:
             continue
         number = model.actuator(name).id
-        if not servo_gains(model, number) or actuated_joint(model, number) is None:
+        if not follows_its_command(model, number) or actuated_joint(model, number) is None:
             result[f"{array} of {name}"] = "Isaac Lab randomises the gains of servos only"
     return result
 

@@ -29,6 +29,7 @@ from npdr_ppl.engines.mujoco.channels import (
     mjcf_sensors,
     state_components,
 )
+from npdr_ppl.engines.mujoco.coupled_joints import coupled_joints
 from npdr_ppl.engines.mujoco.environment import environment_ports, with_environment
 from npdr_ppl.engines.mujoco.fields import element_names, find_field
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
@@ -41,7 +42,7 @@ from npdr_ppl.engines.mujoco.second_joints import (
 )
 from npdr_ppl.engines.mujoco.servos import check_servo, with_servos
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.channels import Channel, Follower
 from npdr_ppl.language.effects import (
     ComplianceEffect,
     Effect,
@@ -159,6 +160,11 @@ class MujocoMechanism(ClosedLoopSimulator):
         names = {c.address: state.name for c, state in states if not c.is_velocity}
         ports = self.force_ports
         return {p.port.name: names[p.position] for p in ports if p.position in names}
+
+    @property
+    def followers(self) -> tuple[Follower, ...]:
+        """States of joints that equality constraints tie to others."""
+        return coupled_joints(self.model, self.components, self.states)
 
     def recorded_settings(self) -> dict[str, Any]:
         """Returns the MJCF's text, the fields that parameters set, and the engine's version."""

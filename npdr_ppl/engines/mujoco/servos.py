@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npdr_ppl.engines.common.chain_state import Tables
-from npdr_ppl.engines.mujoco.fields import actuated_joint, servo_gains
+from npdr_ppl.engines.mujoco.fields import actuated_joint, follows_its_command, servo_gains
 from npdr_ppl.engines.mujoco.parameters import Assignments, present
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.effect_context import Servo
@@ -19,8 +19,8 @@ __all__ = ["ServoErrors", "check_servo", "is_servo", "with_servos"]
 
 
 def is_servo(model: Any, actuator: int) -> bool:
-    """Returns whether an actuator follows a position or a velocity."""
-    return bool(servo_gains(model, actuator))
+    """Returns whether an actuator follows a position or a velocity, which its command states."""
+    return follows_its_command(model, actuator)
 
 
 def with_servos(
@@ -79,6 +79,7 @@ def check_servo(model: Any, actuator: int, effect: str) -> None:
     if (
         has_state
         or actuated_joint(model, actuator) is None
+        or not follows_its_command(model, actuator)
         or "kp" not in servo_gains(model, actuator)
     ):
         raise ModelError(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from npdr_ppl.rollouts.logs.inspection import Description, SignalSummary
 from npdr_ppl.rollouts.logs.log_settings import LogSettings
 from npdr_ppl.rollouts.logs.mapping import settings_lines, toml_key, toml_text
-from npdr_ppl.rollouts.logs.matching import Column, matched
+from npdr_ppl.rollouts.logs.matching import Column, can_be_left_out, matched
 from npdr_ppl.rollouts.logs.signal_names import plain_names
 
 __all__ = ["mapping_to_start_from", "possible_actions", "proposed_actions", "without_signal"]
@@ -107,7 +107,8 @@ def _tables_of_columns(columns: Sequence[Column], signals: Sequence[SignalSummar
         section = "actions" if column.role == "command" else "channels"
         entry = [f"[{section}.{toml_key(column.name)}]"]
         if column.name not in found:
-            hint = "may be left out" if column.rate_of in found else "name it"
+            is_needed = not can_be_left_out(column, columns, found)
+            hint = "name it" if is_needed else "may be left out"
             entry.append('signal = "..."')
             lines += [f"# No signal has a matching name; {hint}:", *map(_comment, entry), ""]
             continue
@@ -126,9 +127,13 @@ def _tables_of_columns(columns: Sequence[Column], signals: Sequence[SignalSummar
 
 
 def without_signal(description: Description, columns: Sequence[Column]) -> list[str]:
-    """Returns the names of a model's columns, without rates, for which a log has no signal."""
+    """Returns the names of a model's positions and commands that a log lacks but has to have."""
     found = matched(columns, _signals(description))
-    return [c.name for c in columns if c.name not in found and c.rate_of is None]
+    return [
+        c.name
+        for c in columns
+        if c.name not in found and c.rate_of is None and not can_be_left_out(c, columns, found)
+    ]
 
 
 def _signals(description: Description) -> list[SignalSummary]:

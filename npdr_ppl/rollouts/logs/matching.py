@@ -2,14 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import NamedTuple
 
-from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.channels import Channel, Follower
 from npdr_ppl.rollouts.logs.inspection import SignalSummary
 from npdr_ppl.rollouts.logs.signal_names import Role, role_of
 
-__all__ = ["Column", "Match", "columns_of", "matched"]
+__all__ = ["Column", "Match", "can_be_left_out", "columns_of", "matched"]
 
 _WITHOUT_MEANING = frozenset(
     "action actions actual angle angles cmd command commands control ctrl current data des "
@@ -31,12 +31,14 @@ class Column(NamedTuple):
         unit: Its unit.
         role: What it is; the role of an action is ``"command"``.
         rate_of: The position whose rate it is; ``None`` for others.
+        follows: The position that it follows from; ``None`` for others.
     """
 
     name: str
     unit: str
     role: Role
     rate_of: str | None = None
+    follows: str | None = None
 
 
 class Match(NamedTuple):
@@ -51,12 +53,42 @@ class Match(NamedTuple):
     doubt: str
 
 
-def columns_of(sensors: Sequence[Channel], actions: Sequence[Channel]) -> list[Column]:
-    """Returns the columns that a model reads: those of its sensors, then those of its actions."""
+def columns_of(
+    sensors: Sequence[Channel], actions: Sequence[Channel], followers: Sequence[Follower] = ()
+) -> list[Column]:
+    """Returns the columns that a model reads: those of its sensors, then those of its actions.
+
+    Args:
+        sensors: The model's sensors.
+        actions: Its actions.
+        followers: Positions that follow from others. Of two that follow from each other, the
+            first one follows.
+    """
+    follows: dict[str, str] = {}
+    for follower in followers:
+        if follower.name not in follows and follower.leader not in follows:
+            follows[follower.name] = follower.leader
     return [
-        *(Column(c.name, c.unit, _role_of_sensor(c), c.rate_of) for c in sensors),
+        *(
+            Column(c.name, c.unit, _role_of_sensor(c), c.rate_of, follows.get(c.name))
+            for c in sensors
+        ),
         *(Column(c.name, c.unit, "command") for c in actions),
     ]
+
+
+def can_be_left_out(
+    column: Column, columns: Sequence[Column], present: Container[str | None]
+) -> bool:
+    """Returns whether a column is not needed beside others that are present.
+
+    Args:
+        column: The column.
+        columns: All columns of the model.
+        present: Names of those that are present.
+    """
+    position = next((c for c in columns if c.name == column.rate_of), column)
+    return column.rate_of in present or position.follows in present
 
 
 def _role_of_sensor(channel: Channel) -> Role:
@@ -77,7 +109,8 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
     the fewest other words is taken.
 
     Columns of a role that do not match are taken in the order of the log if there are as many
-    signals of this role, and no name contradicts it. Numbers do not contradict, because some count
+    signals of this role, and no name contradicts it; those that follow from others do not count if
+    there is no signal for them. Numbers do not contradict, because some count
     joints from 0 and others from 1. A measurement that never changes is no match. Positions and
     velocities that are left can match signals whose role their names do not tell.
 
@@ -97,6 +130,8 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
     for role in dict.fromkeys(column.role for column in columns):
         wanted = [column for column in columns if column.role == role]
         own = [s for s in signals if s.role == role and (role == "command" or not s.is_constant)]
+        leading = [column for column in wanted if column.follows is None]
+        wanted = leading if len(own) == len(leading) else wanted
         doubt = ""
         if role == "command" and not own:
             taken = {match.signal.name for match in result.values()}
