@@ -39,6 +39,8 @@ class Finding:
             its rollouts; empty if it was not sought there.
         is_compared: Whether it was compared with alternatives. If a time limit prevented it, the
             probability says nothing.
+        may_be_step_error: Whether it is shorter than a time step of a simulator that has no finer
+            steps, so that it may be what the steps miss.
     """
 
     effect: Effect
@@ -53,6 +55,7 @@ class Finding:
     repetition: Repetition | None = None
     found_in: tuple[PartResult, ...] = ()
     is_compared: bool = True
+    may_be_step_error: bool = False
 
     @property
     def is_found_again(self) -> bool:
@@ -61,7 +64,7 @@ class Finding:
 
     @property
     def can_be_named(self) -> bool:
-        """Whether it is missing, large enough, and found again in parts of the recording."""
+        """Whether it is missing, large enough, and there is no doubt of it."""
         return not self.is_minor and not self.corrects and not self.doubt
 
     def is_sure(self, confidence: float) -> bool:
@@ -74,7 +77,12 @@ class Finding:
 
     @property
     def doubt(self) -> str:
-        """Why it is not found again in parts of the recording; see :func:`doubt_of`."""
+        """Why it is no cause although it explains something, to follow its name; else empty.
+
+        See :attr:`may_be_step_error` and :func:`doubt_of`.
+        """
+        if self.may_be_step_error:
+            return "is shorter than a time step, and may be the error of the simulator's own steps"
         return doubt_of(self.found_in)
 
     @property

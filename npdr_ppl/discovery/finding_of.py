@@ -11,6 +11,7 @@ from npdr_ppl.discovery.search.repeatability import Repetition, repetitions
 from npdr_ppl.discovery.search.rounds import Search
 from npdr_ppl.discovery.search.settings import EVIDENCE
 from npdr_ppl.discovery.settings import VERDICT
+from npdr_ppl.language.handlers import num_finer_steps
 
 __all__ = ["finding_of", "findings_of"]
 
@@ -104,4 +105,20 @@ def finding_of(
         repetition=repetition,
         found_in=tuple(found_in),
         is_compared=added.is_compared,
+        may_be_step_error=_may_be_step_error(added, search, every),
     )
+
+
+def _may_be_step_error(added: Added, search: Search, every: Mapping[str, Estimate]) -> bool:
+    """Returns whether an effect may be what a simulator's steps miss.
+
+    What an engine of low order misses in a step looks like a delay or a lag of a part of the step.
+    Finer steps would show whether it is one, but not every simulator has them.
+    """
+    simulator, strengths = search.final.simulator, added.effect.strengths
+    has_finer = num_finer_steps(search.final.model) > 0 or simulator.with_finer_steps() is not None
+    if has_finer or not all(p.unit == "s" for p in strengths):
+        return False
+    sites = [f"{added.effect.name}.{p.name}" for p in strengths]
+    known = [abs(every[site].mean) for site in sites if site in every]
+    return bool(known) and max(known) < simulator.time_step
