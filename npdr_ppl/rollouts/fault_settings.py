@@ -19,6 +19,10 @@ class FaultSettings:
             the channel's departures nearby: of spikes, jumps and the last row.
         spike_change: Least size of a spike, in medians of the channel's changes that are not zero.
         mended_share: Share of a departure that may be left after a fault is mended.
+        off_course_share: Least distance of a spike from the line through the two measurements
+            before it and from the line through the two after it, as a share of its departure from
+            a smooth motion. A spike has a share of one. At a kink, a measurement is off one of the
+            lines at most by its noise.
         contradicted_share: Share of a spike of a position that its rate must leave unexplained, in
             the steps before and after it. A driver that differentiates the position gives a rate
             that explains half of it; at an impact, the rate explains one of the steps.
@@ -41,6 +45,7 @@ class FaultSettings:
     jump_size: float = 12.0
     spike_change: float = 4.0
     mended_share: float = 0.1
+    off_course_share: float = 0.5
     contradicted_share: float = 0.25
     largest_loss: int = 10
     left_over: float = 0.3
@@ -62,6 +67,7 @@ class FaultSettings:
             "most_lost",
             "frozen_share",
             "mended_share",
+            "off_course_share",
             "contradicted_share",
             "left_over",
         )

@@ -314,28 +314,58 @@ class _Faults:
 
 
 def _spikes(values: Array) -> NDArray[np.int64]:
-    """Returns the rows of single wrong measurements of a channel ``(N,)``."""
+    """Returns the rows of single wrong measurements of a channel ``(N,)``.
+
+    A spike leaves the course of the channel, and the next measurements return to that course. The
+    spike is therefore off the course before it and off the course after it, and changing this one
+    value makes the channel smooth.
+    """
     departure = _departures(values)
     size = np.abs(departure)
     usual = np.maximum(np.median(size[2:-2]), near(size[:, None])[:, 0]) / 0.6745
     # A device at rest has departures of zero; its encoder still makes single steps.
     changes = np.abs(np.diff(values))
     floor = FAULTS.spike_change * np.median(changes[changes > 0]) if changes.any() else np.inf
-    suspicious = np.flatnonzero((size > FAULTS.jump_size * usual) & (size > floor))
+    is_large = (size > FAULTS.jump_size * usual) & (size > floor)
     rows = []
-    for row in suspicious:
+    for row in np.flatnonzero(is_large & _leaves_and_returns(values, departure)):
         if size[row] < size[max(0, row - 2) : row + 3].max():
             continue
         mended = values.copy()
         mended[row] -= departure[row]
         around = slice(max(2, row - 1), min(len(values) - 2, row + 2))
         left = _departures(mended[around.start - 2 : around.stop + 2])[2:-2]
-        # A step, a kink or an impact is not mended by changing one value.
+        # A step or a pulse of several measurements is not mended by changing one value.
         if np.abs(left).max() < max(FAULTS.mended_share * size[row], 4.0 * usual[row]):
             rows.append(int(row))
     if len(rows) > FAULTS.most_lost * len(values):
         return np.array([], dtype=np.int64)
     return np.array(rows, dtype=np.int64)
+
+
+def _leaves_and_returns(values: Array, departure: Array) -> NDArray[np.bool_]:
+    """Returns which of values ``(N,)`` leave a course that the next values return to.
+
+    The courses before and after a row are the lines through the two measurements on that side.
+    At a spike, both lines pass the row at nearly the same value, and the measurement departs from
+    both by the size of the spike. At a kink, an impact or a step of a command, the measurement
+    lies on one line, on both, or between them: the channel goes on from it.
+
+    Args:
+        values: A channel's measurements.
+        departure: Their distances from the cubic through their neighbours, ``(N,)``.
+
+    Returns:
+        Whether each measurement leaves and returns, ``(N,)``. False at both ends, where there are
+        not two measurements on each side.
+    """
+    before = 2.0 * values[1:-3] - values[:-4]
+    after = 2.0 * values[3:-1] - values[4:]
+    nearest = np.minimum(np.abs(values[2:-2] - before), np.abs(values[2:-2] - after))
+    least = FAULTS.off_course_share * np.abs(departure[2:-2])
+    result = np.zeros(len(values), dtype=bool)
+    result[2:-2] = nearest > np.maximum(least, np.abs(after - before))
+    return result
 
 
 def _departures(values: Array) -> Array:

@@ -5,7 +5,7 @@ import pytest
 
 import npdr_ppl as npdr
 from npdr_ppl.models.pendulum import Pendulum
-from npdr_ppl.rollouts.faults import _Faults, without_faults
+from npdr_ppl.rollouts.faults import _Faults, _spikes, without_faults
 
 STEP = 0.01
 CHANNELS = Pendulum().sensors
@@ -128,6 +128,56 @@ def test_an_impact_at_any_part_of_a_step_is_no_spike(part):
     near = slice(200, 400)
     found = without_faults(recording(height[near], speed[near]), CHANNELS)
     assert not any("spike" in note for note in found.notes)
+
+
+def driven_pressure(seed, step=0.005, time_constant=0.03):
+    """Returns a noisy first-order response [Pa] to a square wave on a slow sine, 8 s long."""
+    time = step * np.arange(1600)
+    between = (time > 2.0) & (time < 6.0)
+    command = 0.3 * np.sin(1.5 * time) + 0.15 * between * np.sign(np.sin(6.0 * np.pi * time))
+    pressure, kept = np.zeros(len(time)), np.exp(-step / time_constant)
+    for k in range(len(time) - 1):
+        pressure[k + 1] = kept * pressure[k] + (1.0 - kept) * 5e6 * command[k]
+    return pressure + np.random.default_rng(seed).normal(0.0, 5e3, len(time))
+
+
+def pressure_recording(pressure):
+    return npdr.Rollouts.from_arrays(
+        [pressure[:, None]],
+        [np.zeros((len(pressure) - 1, 1))],
+        channel_names=("pressure",),
+        action_names=("valve",),
+        time_step=0.005,
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_fast_response_to_steps_of_a_command_is_no_spike(seed):
+    pressure = (npdr.Channel("pressure", "Pa"),)
+    steps = pressure_recording(driven_pressure(seed))
+    assert without_faults(steps, pressure) is steps
+    # A spike between the steps is still found, and costs one measurement.
+    spiked = driven_pressure(seed)
+    spiked[820] += 1e6
+    found = without_faults(pressure_recording(spiked), pressure)
+    assert np.flatnonzero(~found.samplings[0].is_read[:, 0]).tolist() == [820]
+
+
+@pytest.mark.parametrize("size", [13.0, 16.0, 19.0, 30.0])
+def test_a_kink_of_any_size_is_no_spike(size):
+    # The cubic through a kink's neighbours misses it by a third of the change of slope.
+    kink = 3.6 * size * np.maximum(np.arange(600) - 300, 0.0)
+    for seed in range(10):
+        noise = np.random.default_rng(seed).normal(0.0, 1.0, 600)
+        assert not len(_spikes(noise + kink))
+
+
+def test_a_measurement_from_which_the_channel_decays_is_no_spike():
+    # A load that jumps by 1.1 at a step of a command and then falls by 60 % per step.
+    for seed in range(10):
+        load = np.random.default_rng(seed).normal(0.0, 0.03, 600)
+        load[300:] += 1.1 * 0.4 ** np.arange(300)
+        assert not len(_spikes(load))
 
 
 def test_a_position_midway_between_its_neighbours_raises_no_warning():
