@@ -5,6 +5,8 @@ import importlib.util
 import inspect
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -21,11 +23,16 @@ __all__ = [
     "class_name",
     "is_importable",
     "load_python_file",
+    "neighbours_of",
     "own_names",
 ]
 
 _TEXT = "__npdr_text__"
 """Name in a loaded module of the bytes that it was loaded from."""
+
+
+class _Folder(str):
+    """The folder of a loaded file in ``sys.path``, which is no installed package's."""
 
 
 def check_exists(path: Path, pattern: str, ending: str = "") -> None:
@@ -80,6 +87,66 @@ def load_python_file(path: Path) -> ModuleType:
     return module
 
 
+@contextmanager
+def neighbours_of(path: Path) -> Iterator[None]:
+    """Lets a file that is loaded inside the block import the Python files beside it.
+
+    The folder stays at the end of ``sys.path``, for imports inside functions and for worker
+    processes, which get this path. Unlike a script's folder it comes after the libraries: a
+    neighbour called ``json.py`` does not replace the library, and an installed package comes
+    before a neighbour of the same name.
+
+    Two files in different folders may not import neighbours of the same name, because a worker
+    would find only one of them. Imports inside functions are not checked for this.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ModelError: The file imported a neighbour whose name is that of another file's neighbour.
+    """
+    folder = str(path.parent.absolute())
+    if folder not in sys.path:
+        # Before the folders of other files, so that its own neighbours are found first.
+        marked = [i for i, other in enumerate(sys.path) if isinstance(other, _Folder)]
+        sys.path.insert(min(marked, default=len(sys.path)), _Folder(folder))
+    others = _neighbours_elsewhere(folder)
+    for name in others:
+        del sys.modules[name]
+    try:
+        yield
+        both = [name for name in others if name in sys.modules]
+    finally:
+        sys.modules.update(others)
+    if both:
+        # The file's own module is forgotten, so that loading it again fails in the same way.
+        for name, module in list(sys.modules.items()):
+            if getattr(module, "__file__", None) == str(path.absolute()):
+                del sys.modules[name]
+        raise ModelError(
+            f"{path} imports {both[0]}.py, but another file has imported "
+            f"{others[both[0]].__file__}, which has the same name; rename one of them."
+        )
+
+
+def _neighbours_elsewhere(folder: str) -> dict[str, ModuleType]:
+    """Returns the neighbours of other files by name that a folder has modules for, too."""
+    folders = {other for other in sys.path if isinstance(other, _Folder)} - {folder}
+    found = {}
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        # The other entries of sys.modules are quickly told apart by their folder.
+        if file is not None and _home(Path(file)) in folders and "." not in name:
+            if PathFinder.find_spec(name, [folder]) is not None:
+                found[name] = module
+    return found
+
+
+def _home(file: Path) -> str:
+    """Returns the folder in which a module or package is found."""
+    return str(file.parent.parent if file.stem == "__init__" else file.parent)
+
+
 def own_names(module: ModuleType) -> list[str]:
     """Returns the names of the functions and classes that a module itself defines."""
     name = module.__name__
@@ -89,14 +156,15 @@ def own_names(module: ModuleType) -> list[str]:
 def is_importable(module: str) -> bool:
     """Returns whether a module belongs to an installed package.
 
-    Modules of :func:`load_python_file` and ``__main__`` do not.
+    Modules of :func:`load_python_file`, files beside them, and ``__main__`` do not.
 
     Args:
         module: Its name, e.g. ``"npdr_ppl.models.pendulum"``.
     """
     # importlib.util.find_spec would also find modules that were loaded from a file by path.
     top = module.partition(".")[0]
-    return top != "__main__" and PathFinder.find_spec(top) is not None
+    installed = [folder for folder in sys.path if not isinstance(folder, _Folder)]
+    return top != "__main__" and PathFinder.find_spec(top, installed) is not None
 
 
 def class_file(cls: type[Any]) -> Path | None:

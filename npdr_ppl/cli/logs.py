@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from npdr_ppl.atomic_files import replacing
+from npdr_ppl.cli.inspected_models import inspect_model
 from npdr_ppl.cli.manners import AsJson
 from npdr_ppl.cli.model_files import is_robot
-from npdr_ppl.cli.names import complete_model
+from npdr_ppl.cli.names import MODELS, complete_model
 from npdr_ppl.cli.options import MappingOption, OutOption
 from npdr_ppl.cli.resolve import columns_of_model
 from npdr_ppl.cli.robots import inspect_robot
@@ -38,7 +39,9 @@ def inspect(
         Path,
         typer.Argument(
             help="CSV, Parquet, HDF5, MAT, MCAP, a ROS 2 bag, a LeRobot data set, a folder of "
-            "CSV files, or a robot's MJCF or URDF file."
+            "CSV files; or a model: a robot's MJCF or URDF file, path/to/file.py:function, or "
+            "a model of the zoo.",
+            autocompletion=complete_model,
         ),
     ],
     mapping: MappingOption = None,
@@ -62,8 +65,8 @@ def inspect(
 ) -> None:
     """Show the signals of a log: rate, largest gap, jitter, range, unit, and what they may be.
 
-    Of a robot's MJCF or URDF file it shows the parameters of the model that is derived from it,
-    the columns that a log needs, and the ports of effects.
+    Of a model, such as a robot's MJCF or URDF file, it shows the parameters with their priors, the
+    columns that a log needs, and the ports of effects.
 
     Example: npdr inspect bag_folder --model robot.xml --write mapping.toml
     """
@@ -83,6 +86,14 @@ def inspect(
                 f"--mapping, --model, --time and --time-step are for logs; {log} is a robot."
             )
         inspect_robot(log, write, as_json)
+        return
+    if _is_model(log):
+        if mapping is not None or model or time or time_step is not None or write is not None:
+            raise DataError(
+                "--mapping, --write, --model, --time and --time-step are for logs; "
+                f"{log} is a model."
+            )
+        inspect_model(str(log), as_json)
         return
     if model and write is None:
         raise DataError("--model is for the mapping that --write writes; name its file.")
@@ -121,6 +132,13 @@ def inspect(
                     typer.echo(_wrapped(f"No signal was found for {', '.join(missing)}."))
             else:
                 _print_lack_of_actions(found)
+
+
+def _is_model(log: Path) -> bool:
+    """Returns whether an argument names a model rather than a log."""
+    if log.exists():
+        return log.suffix == ".py"
+    return str(log) in MODELS or ".py:" in str(log)
 
 
 def convert(

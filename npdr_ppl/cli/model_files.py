@@ -11,7 +11,7 @@ from typing import Any
 
 from npdr_ppl.engines.common.robot_files import relative_to
 from npdr_ppl.errors import ModelError
-from npdr_ppl.python_files import check_exists, load_python_file, own_names
+from npdr_ppl.python_files import check_exists, load_python_file, neighbours_of, own_names
 
 __all__ = ["ROBOTS", "derived_model", "is_robot", "load_function", "load_relative"]
 
@@ -72,11 +72,22 @@ def load_function(path: Path, function: str) -> Callable[..., Any]:
 def load_relative(path: Path) -> ModuleType:
     """Returns the module of a Python file, whose paths are relative to the file's folder.
 
+    It can import the Python files beside it; see :func:`npdr_ppl.python_files.neighbours_of`.
+
     Args:
         path: The file, which must exist.
 
     Raises:
         ModelError: The file raises an error.
     """
-    with relative_to(path.parent):
-        return load_python_file(path)
+    try:
+        with relative_to(path.parent), neighbours_of(path):
+            return load_python_file(path)
+    except ModelError as error:
+        lacks = error.__cause__
+        if not isinstance(lacks, ModuleNotFoundError):
+            raise
+        raise ModelError(
+            f"{error} If it is a file of yours, put {path.name} into the same folder, or set "
+            "PYTHONPATH to the file's folder; if it is a package, install it."
+        ) from lacks

@@ -1,12 +1,21 @@
 """What all result tables on the terminal share."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
-__all__ = ["console_for_tables", "percent", "print_notes", "print_preparation", "print_reason"]
+__all__ = [
+    "WIDTH",
+    "broken",
+    "console_for_tables",
+    "percent",
+    "print_notes",
+    "print_preparation",
+    "print_reason",
+]
 
 WIDTH = 100
 """Width in characters of a table that is written to a file or a pipe."""
@@ -17,6 +26,21 @@ def console_for_tables() -> Console:
     console = Console()
     # Without a terminal, rich assumes 80 columns, which would split numbers.
     return console if console.is_terminal else Console(width=WIDTH)
+
+
+def broken(name: str, width: int) -> str:
+    """Returns a name with line breaks behind underscores and dots, where it is wider than a width.
+
+    Args:
+        name: The name, such as ``"shoulder_pan_joint_armature"``.
+        width: Maximum width in characters; a part without underscores and dots may be wider.
+    """
+    lines = [""]
+    for part in re.findall(r"[^_.]*[_.]|[^_.]+", name):
+        if lines[-1] and len(lines[-1] + part) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(lines)
 
 
 def print_reason(console: Console, what: str, reason: str) -> None:

@@ -3,12 +3,14 @@
 import json
 import math
 import os
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from npdr_ppl.atomic_files import replacing
+from npdr_ppl.cli.printing import WIDTH
 from npdr_ppl.progress import words_for
 from npdr_ppl.python_files import check_exists
 
@@ -17,7 +19,9 @@ if TYPE_CHECKING:
     from npdr_ppl.engines.mujoco.derived_model import DerivedModel
     from npdr_ppl.language.channels import Channel
 
-__all__ = ["inspect_robot"]
+__all__ = ["column_lines", "in_columns", "inspect_robot", "port_lines"]
+
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 
 RECORDED = 10.0
 """Length in s of the recording for which times are printed."""
@@ -138,7 +142,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
     """Returns the description as text."""
     from npdr_ppl.preparation.expected_time import FEWEST_FITS, MOST_FITS
 
-    step, parameters, columns = found["time step"], found["parameters"], found["columns"]
+    step, parameters = found["time step"], found["parameters"]
     rows = [("parameter", "file", "prior", "unit", "sets")]
     for p in parameters:
         low, high = p["prior"]
@@ -147,32 +151,15 @@ def _lines(found: dict[str, Any]) -> list[str]:
     lines = [
         f"{found['file']}: {len(parameters)} parameters, time step {step:g} s ({1 / step:.4g} Hz)",
         "",
-        *_table(rows),
+        *in_columns(rows),
     ]
     if any(p["family"] == "log-normal" for p in parameters):
         lines += ["  * log-normal; the range has 95 % of it"]
     if found["not varied"]:
         lines += ["", "Not varied, because positions do not determine them:"]
         lines += [f"  {field}: {reason}" for field, reason in found["not varied"].items()]
-    rows = [("column of a log", "unit", "")]
-    rows += [("time", "s", "constant steps, also other ones than the file's")]
-    for c in columns:
-        span = "" if c["range"] is None else "{:.4g} … {:.4g}".format(*c["range"])
-        limits = f"joint limits {span}" if span else ""
-        remark = "may be left out" if c["may be left out"] else limits
-        if c["role"] == "command":
-            remark = f"command, {span}" if span else "command"
-        rows.append((c["name"], c["unit"], remark))
-    lines += ["", *_table(rows)]
-    if not any(c["role"] == "command" for c in columns):
-        lines.append("  No actuators: the motion is taken as free.")
-    lines.append(
-        "  Other names in a log: npdr inspect LOG --model FILE --write MAPPING, then --mapping."
-    )
-    lines += ["", "Ports, where effects attach (npdr effects):"]
-    for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
-        names = [port["name"] for port in found["ports"] if port["kind"] == kind]
-        lines.append(f"  {kind}: {', '.join(names)}")
+    hint = "npdr inspect LOG --model FILE --write MAPPING"
+    lines += ["", *column_lines(found, hint), "", *port_lines(found)]
     expected = found["expected time"]
     if expected["first fit"] is not None:
         first = words_for(expected["first fit"])
@@ -181,11 +168,58 @@ def _lines(found: dict[str, Any]) -> list[str]:
             ("npdr discover", f"{FEWEST_FITS} to {MOST_FITS} times as long", ""),
         ]
         title = f"Expected time on this machine, for {expected['recorded']:g} s of recording"
-        lines += ["", f"{title}, roughly:", *_table(rows)]
+        lines += ["", f"{title}, roughly:", *in_columns(rows)]
     return lines
 
 
-def _table(rows: list[tuple[str, ...]]) -> list[str]:
+def column_lines(found: dict[str, Any], hint: str) -> list[str]:
+    """Returns the lines about the columns that a log needs.
+
+    Args:
+        found: The description of a model, with ``columns``.
+        hint: The command that maps other names.
+    """
+    # Only joints of robots' files have limits that a simulation knows.
+    limits = "joint limits" if "file" in found else "range"
+    rows = [("column of a log", "unit", "")]
+    rows += [("time", "s", "constant steps, also other ones than the model's")]
+    for c in found["columns"]:
+        span = "" if c["range"] is None else "{:.4g} … {:.4g}".format(*c["range"])
+        remark = f"{limits} {span}" if span else ""
+        if c["may be left out"]:
+            remark = "may be left out"
+        if c["role"] == "command":
+            remark = f"command, {span}" if span else "command"
+        rows.append((c["name"], c["unit"], remark))
+    lines = in_columns(rows)
+    if not any(c["role"] == "command" for c in found["columns"]):
+        lines.append("  No actuators: the motion is taken as free.")
+    return [*lines, f"  Other names in a log: {hint}, then --mapping."]
+
+
+def port_lines(found: dict[str, Any]) -> list[str]:
+    """Returns the lines about the ports of a model, which ``found`` describes."""
+    lines = ["Ports, where effects attach (npdr effects) by --effect PORT.EFFECT:"]
+    for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
+        same = [port for port in found["ports"] if port["kind"] == kind]
+        names = [f"{p['name']} [{p['unit']}]" if p["unit"] else p["name"] for p in same]
+        # A name stays in one line with its unit, which may have spaces in it.
+        whole = [name.replace(" ", _NO_BREAK) for name in names]
+        told = f"  {kind}: {', '.join(whole)}"
+        parts = textwrap.wrap(
+            told,
+            WIDTH,
+            subsequent_indent="    ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        lines += [part.replace(_NO_BREAK, " ") for part in parts]
+    if not found["ports"]:
+        lines.append("  none are declared")
+    return lines
+
+
+def in_columns(rows: list[tuple[str, ...]]) -> list[str]:
     """Returns rows with columns of equal width."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [

@@ -9,7 +9,13 @@ from rich.box import SIMPLE
 from rich.markup import escape
 from rich.table import Table
 
-from npdr_ppl.cli.printing import console_for_tables, percent, print_preparation, print_reason
+from npdr_ppl.cli.printing import (
+    broken,
+    console_for_tables,
+    percent,
+    print_preparation,
+    print_reason,
+)
 from npdr_ppl.cli.show_discovery import show_discovery
 from npdr_ppl.drawing.numbers import number
 
@@ -25,19 +31,30 @@ __all__ = [
 FIGURES = {"mean": 9, "sd": 7, "94 % HDI": 21, "most likely": 11, "contraction": 11}
 """Numeric columns and their widths in characters."""
 
+NARROWEST_NAME = 12
+"""Minimum width of the column with names of parameters, in characters."""
+
+RETURNS = (
+    "Real return: of the policy that ran on the target in this iteration. Simulated return: of "
+    "the policy trained in this iteration, which runs on the target in the next one; it is a mean "
+    "over the simulators that the policy was trained in."
+)
+"""Which policies the two returns of training belong to."""
+
 
 def show_fit(result: Mapping[str, Any], out: Path) -> None:
     """Prints the content of ``fit.json``."""
     console = console_for_tables()
-    table = Table(title=f"Posterior ({result['backend']})", box=SIMPLE)
-    # Long names of effects' parameters are folded; numbers are never cut.
+    table = Table(title=f"Posterior ({result['backend']})", box=SIMPLE, padding=(0, 1, 0, 0))
+    # Long names of parameters take several lines; numbers are never cut.
+    width = max(NARROWEST_NAME, console.width - sum(FIGURES.values()) - 2 * (len(FIGURES) + 1))
     table.add_column("parameter", overflow="fold")
-    for column, width in FIGURES.items():
-        table.add_column(column, justify="right", no_wrap=True, min_width=width)
+    for column, least in FIGURES.items():
+        table.add_column(column, justify="right", no_wrap=True, min_width=least)
     contraction = result["diagnosis"]["contraction"]
     for name, p in result["parameters"].items():
         table.add_row(
-            name,
+            escape(broken(name, width)),
             f"{p['mean']:.4g}",
             f"{p['sd']:.2g}",
             f"{p['hdi_94'][0]:.4g} … {p['hdi_94'][1]:.4g}",
@@ -47,9 +64,16 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
     console.print(table)
     metrics, seconds = result["metrics"], result["seconds"]
     console.print(
-        f"RMSE {metrics['rmse']:.3f}, DTW {metrics['dtw']:.0f} on {metrics['evaluated_on']} "
-        f"rollouts (most likely draw); simulate {seconds['simulate']:.1f} s, "
-        f"train {seconds['train']:.1f} s, sample {seconds['sample']:.1f} s"
+        f"RMSE {number(metrics['rmse'])}, DTW {number(metrics['dtw'], '.4g')} on "
+        f"{metrics['evaluated_on']} rollouts (most likely draw, simulated from the start of each "
+        "segment). Neither has a unit: each channel is divided by its largest measured value. The "
+        "RMSE is a mean over channels; the DTW distance is a sum over steps.",
+        highlight=False,
+    )
+    console.print(
+        f"Simulated for {seconds['simulate']:.1f} s, trained for {seconds['train']:.1f} s, "
+        f"sampled for {seconds['sample']:.1f} s.",
+        highlight=False,
     )
     print_preparation(console, result)
     console.print(
@@ -99,23 +123,27 @@ def show_comparison(result: Mapping[str, Any], out: Path) -> None:
 
 
 def show_training(result: Mapping[str, Any], out: Path) -> None:
-    """Prints the content of ``train.json``, a row for each iteration."""
+    """Prints the content of ``train.json``, a row for each decision of each iteration."""
     console = console_for_tables()
-    table = Table(title="Returns on the target and in simulation", box=SIMPLE)
+    table = Table(
+        title="Returns on the target and in simulation",
+        caption=RETURNS,
+        caption_justify="left",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+    )
     table.add_column("iteration", justify="right", no_wrap=True)
-    table.add_column("real return", justify="right", no_wrap=True)
+    table.add_column("real\nreturn", justify="right", no_wrap=True)
     table.add_column("decision", no_wrap=True)
-    table.add_column("action", no_wrap=True)
-    # Return of the policy that this iteration trained; the next iteration runs it.
-    table.add_column("simulated return", justify="right", no_wrap=True)
+    table.add_column("action")
+    table.add_column("simulated\nreturn", justify="right", no_wrap=True)
     for iteration, row in enumerate(result["iterations"], start=1):
-        table.add_row(
-            str(iteration),
-            _spread(row["real_returns"]),
-            "\n".join(decision["decision"] for decision in row["decisions"]),
-            "\n".join(decision["action"] for decision in row["decisions"]),
-            number(row.get("sim_return"), ".0f"),
-        )
+        cells = [str(iteration), _spread(row["real_returns"])]
+        last = len(row["decisions"]) - 1
+        for index, decision in enumerate(row["decisions"]):
+            simulated = number(row.get("sim_return"), ".0f") if index == last else ""
+            table.add_row(*cells, decision["decision"], decision["action"], simulated)
+            cells = ["", ""]
     console.print(table)
     last = result["iterations"][-1]
     print_preparation(console, last)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from npdr_ppl.cli.printing import console_for_tables, percent, print_notes, print_reason
+from npdr_ppl.cli.printing import broken, console_for_tables, percent, print_notes, print_reason
 from npdr_ppl.drawing.effect_names import why_unnamed
 from npdr_ppl.drawing.experiment_words import ranges_of_commands, values_that_differ
 from npdr_ppl.drawing.numbers import number
@@ -25,6 +25,12 @@ MOST_ROWS = 10
 
 WIDEST_NAME = 29
 """Maximum width of the column with effect names, in characters."""
+
+WIDEST_PARAMETER = 36
+"""Maximum width of the column with names of parameters, in characters; the others need 62."""
+
+MOST_PARAMETERS = 25
+"""Maximum number of rows of the table of parameters, so that it fits a screen."""
 
 
 def show_discovery(found: Mapping[str, Any], out: Path) -> None:
@@ -60,7 +66,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
                 unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
                 low, high = p["hdi_94"]
                 table.add_row(
-                    escape(name),
+                    escape("\n".join(broken(line, WIDEST_NAME) for line in name.split("\n"))),
                     escape(parameter + unit),
                     probability,
                     number(p["mean"], ".4g"),
@@ -89,6 +95,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             if doubt := told_doubt(effect):
                 name = f"{effect['port']}.{effect['effect']}"
                 console.print(escape(f"{name} {doubt}."))
+    _show_parameters(console, found)
     if found.get("learned"):
         _show_learned(console, found["learned"])
     if found["gap"]:
@@ -111,8 +118,9 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
         console.print(found["preparation"]["sentence"], highlight=False)
     print_reason(console, found["verdict"], found["reason"])
     if found["remainder"]["fired"] and found["verdict"] != "unknown":
-        share = found["remainder"]["unexplained"]
-        console.print(f"A smaller misfit remains: {share:.2%} of the disagreement.")
+        share = f"{found['remainder']['unexplained']:.2%}"
+        if float(share.rstrip("%")) > 0.0:
+            console.print(f"A smaller misfit remains: {share} of the disagreement.")
     for channel, count in found["counts"].items():
         if count["share"] > WORTH_TELLING:
             console.print(
@@ -121,6 +129,36 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             )
     if (experiment := found["next_experiment"]) is not None:
         print_reason(console, "next experiment", _advice(experiment))
+
+
+def _show_parameters(console: Console, found: Mapping[str, Any]) -> None:
+    """Prints the parameters of the revised model, apart from those of the effects added."""
+    added = tuple(f"{row['port']}.{row['effect']}." for row in found["effects"])
+    rows = {
+        name: row
+        for name, row in found.get("parameters", {}).items()
+        if not name.startswith(added)
+    }
+    if not rows:
+        return
+    which = "Other parameters of the revised model" if added else "Parameters of the model"
+    table = Table(title=which, box=SIMPLE, padding=(0, 1, 0, 0))
+    table.add_column("parameter", overflow="fold")
+    for column in ("mean", "sd", "94 % HDI"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("unit", overflow="fold")
+    for name, p in list(rows.items())[:MOST_PARAMETERS]:
+        low, high = p["hdi_94"]
+        table.add_row(
+            escape(broken(name, WIDEST_PARAMETER)),
+            number(p["mean"], ".4g"),
+            number(p["sd"], ".2g"),
+            f"{number(low, '.4g')} … {number(high, '.4g')}",
+            "" if p["unit"] in ("", "1") else escape(p["unit"]),
+        )
+    console.print(table)
+    if (left := len(rows) - MOST_PARAMETERS) > 0:
+        console.print(f"{left} more parameters are in discovery.json.", highlight=False)
 
 
 def _show_learned(console: Console, learned: Mapping[str, Any]) -> None:

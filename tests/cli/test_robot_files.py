@@ -140,6 +140,41 @@ def test_inspect_prints_and_writes_the_model(folder, tmp_path, monkeypatch, caps
     assert code == 0, err
 
 
+MODEL = """
+import pyro, pyro.distributions as dist
+import npdr_ppl as npdr
+from npdr_ppl.models.pendulum import Pendulum
+
+def model(inputs):
+    mass = pyro.sample("mass", dist.LogNormal(0.0, 0.1))
+    length = pyro.sample("length", dist.Uniform(0.5, 1.5))
+    return npdr.simulate("trajectory", Pendulum(), {"mass": mass, "length": length}, inputs)
+"""
+
+
+def test_inspect_shows_models_in_python_and_of_the_zoo(tmp_path, monkeypatch, capsys):
+    (tmp_path / "rod.py").write_text(MODEL)
+    word = f"{tmp_path}/rod.py:model"
+    code, out, err = run(monkeypatch, capsys, "inspect", word)
+    assert code == 0, err
+    for line in (
+        r"mass +1 +0\.822 … 1\.217\* +kg +LogNormal\(0, 0\.1\); mass of the rod",
+        r"length +1 +0\.5 … 1\.5 +m",
+        r"velocity +rad/s +may be left out",
+        r"torque +N m +command, -4\.5 … 4\.5",
+        r"force: hinge \[N m\]",
+    ):
+        assert re.search(line, out), line
+    code, out, _ = run(monkeypatch, capsys, "inspect", word, "--json")
+    assert [p["name"] for p in json.loads(out)["parameters"]] == ["mass", "length"]
+    code, out, _ = run(monkeypatch, capsys, "inspect", "pendulum")
+    assert code == 0 and "npdr fit pendulum --data LOG" in out
+    code, _, err = run(monkeypatch, capsys, "inspect", tmp_path / "rod.py")
+    assert code == 2 and f"as in {tmp_path}/rod.py:model." in err
+    code, _, err = run(monkeypatch, capsys, "inspect", word, "--write", tmp_path / "rod.toml")
+    assert code == 2 and "is a model" in err
+
+
 def test_a_path_may_also_be_relative_to_the_working_directory(folder, tmp_path, monkeypatch):
     from npdr_ppl.cli.resolve import resolve_model
 

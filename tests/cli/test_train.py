@@ -78,7 +78,7 @@ def test_a_run_and_its_continuation(monkeypatch, capsys, tmp_path, rig):
     with without_remedies():
         code, text, err = run(monkeypatch, capsys, *words, "--iterations", 1, "--animate")
     assert code == 0, err
-    assert "simulated return" in text and "decisions are only logged" in text
+    assert "Simulated return" in text and "decisions are only logged" in text
     assert "deploy: The policy succeeds in" in text
     assert max(map(len, text.splitlines())) <= 100
     first = json.loads((out / "train.json").read_text())
