@@ -166,6 +166,7 @@ def sample_posterior(
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]
     z, w, target, log_mixture = (torch.empty(0, dtype=torch.float64) for _ in range(4))
     result: WeightedDraws | None = None
+    last_asked = 0
     for iteration in range(most_iterations or settings.most_iterations):
         with seeded(seed, "importance", iteration):
             new_w = own[-1].density.sample(settings.draws_per_iteration).double()
@@ -196,8 +197,11 @@ def sample_posterior(
         is_enough = result.has_enough
         if is_enough and (not space.num_weak or (iteration == 0 and not given)):
             break
-        if not is_rough and (led := _led(result, target, likelihood, seed)) is not None:
-            return led
+        # A polynomial that failed is not asked again before there are twice as many draws.
+        if not is_rough and len(z) >= 2 * last_asked:
+            last_asked = len(z)
+            if (led := _led(result, target, likelihood, seed)) is not None:
+                return led
         if is_enough:
             break
         if iteration + 1 >= settings.iterations_to_adapt and size < z.shape[1]:
