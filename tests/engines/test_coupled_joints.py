@@ -1,4 +1,4 @@
-"""A gripper whose fingers an equality constraint ties, behind a servo with a command of its own."""
+"""A gripper with fingers that an equality ties, behind a servo whose command has its own unit."""
 
 import numpy as np
 import pytest
