@@ -68,7 +68,7 @@ def few_draws(monkeypatch):
     """Gives the check of a posterior too few draws to agree with the simulator."""
     few = replace(
         importance_sampling.IMPORTANCE_SAMPLING,
-        most_iterations=1, draws_per_iteration=8, draws_of_given=8,
+        most_iterations=1, draws_per_iteration=8, draws_of_given=8, num_walkers=4,
     )  # fmt: skip
     monkeypatch.setattr(importance_sampling, "IMPORTANCE_SAMPLING", few)
     fewer = replace(estimator_check.ESTIMATOR_CHECK, num_draws=16)
