@@ -86,8 +86,12 @@ def _expected_time(path: Path, robot: "MujocoSimulator") -> dict[str, float | No
 
 def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
     """Returns what is known of a robot, for JSON."""
+    from npdr_ppl.rollouts.logs.matching import columns_of
+
     rates = {state.name: state.rate_of for state in robot.states}
     limits = _joint_limits(robot)
+    # Of two joints that follow from each other, the first one follows.
+    followers = {c.name for c in columns_of(robot.sensors, (), robot.followers) if c.follows}
 
     def column(channel: "Channel", role: str) -> dict[str, Any]:
         ends = limits.get(channel.name, [channel.lower, channel.upper])
@@ -96,7 +100,7 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
             "unit": channel.unit,
             "role": role,
             "range": ends if all(map(math.isfinite, ends)) else None,
-            "may be left out": rates.get(channel.name) is not None,
+            "may be left out": channel.name in followers or rates.get(channel.name) is not None,
         }
 
     return {
