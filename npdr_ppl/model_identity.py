@@ -11,12 +11,20 @@ from pyro.poutine.messenger import Messenger
 
 from npdr_ppl.language.effects import Effect
 from npdr_ppl.language.handlers import ModelWithEffects, ModelWithFinerSteps
+from npdr_ppl.language.layers import Layer
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 from npdr_ppl.python_files import class_file, is_importable
 
-__all__ = ["engine_settings", "file_text", "model_name", "source_text", "versions"]
+__all__ = [
+    "described",
+    "engine_settings",
+    "model_name",
+    "source_text",
+    "unwrapped",
+    "versions",
+]
 
 _PACKAGES = ("npdr-ppl", "torch", "pyro-ppl", "zuko", "numpy", "arviz")
 
@@ -55,7 +63,7 @@ def source_text(model: Any) -> str:
     between two runs, the file's text is returned, too.
     """
     if isinstance(model, ModelWithEffects):
-        attached = "\n".join(f"# with {e!r}{_own_file(e)}" for e, _ in model.effects)
+        attached = "\n".join(f"# with {described(e)}" for e, _ in model.effects)
         return f"{source_text(model.base)}\n{attached}"
     if _is_wrapped(model):
         return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
@@ -67,17 +75,23 @@ def source_text(model: Any) -> str:
         return repr(model)
 
 
-def file_text(model: Any) -> str:
-    """Returns the file that defines a model; often its simulator is defined there, too.
+def unwrapped(model: Any) -> tuple[Any, list[Effect]]:
+    """Returns a model without layers and handlers, and the effects that were attached to it."""
+    effects: list[Effect] = []
+    while True:
+        if _is_wrapped(model):
+            model = model.args[-1]
+        elif isinstance(model, Layer):
+            own = model.effects if isinstance(model, ModelWithEffects) else ()
+            effects = [*(effect for effect, _ in own), *effects]
+            model = model.base
+        else:
+            return model, effects
 
-    Empty if there is no such file.
-    """
-    while _is_wrapped(model) or hasattr(model, "base"):
-        model = model.args[-1] if _is_wrapped(model) else model.base
-    try:
-        return Path(inspect.getsourcefile(model) or "").read_text(encoding="utf-8")
-    except (OSError, TypeError, UnicodeDecodeError):
-        return ""
+
+def described(effect: Effect) -> str:
+    """Returns an effect's arguments, and the text of the user's file that defines it if any."""
+    return f"{effect!r}{_own_file(effect)}"
 
 
 def _own_file(effect: Effect) -> str:

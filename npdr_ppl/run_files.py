@@ -41,6 +41,7 @@ LOCK = ".lock"
 
 IN_WORDS = {
     "binding": "how the data are prepared",
+    "code": "the model's code or a file that it names",
     "features": "what is read from the data or the model",
     "fingerprint": "the data",
     "model": "the model's source",

@@ -26,6 +26,7 @@ from npdr_ppl.discovery.investigation import Investigation
 from npdr_ppl.discovery.kept_fits import keep_fits
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
+from npdr_ppl.model_code import code_checksum
 from npdr_ppl.model_identity import model_name, source_text, versions
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.rollouts import Rollouts
@@ -90,6 +91,7 @@ class DiscoveryFolder:
                     "name": model_name(model),
                     "source": source_text(model),
                 },
+                "code": code_checksum(model),
                 "options": settings,
                 "seed": seed,
                 "recordings": [checksum(r) for r in (rollouts, holdout) if r is not None],

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.model_identity import file_text, source_text, versions
+from npdr_ppl.model_code import code_checksum
+from npdr_ppl.model_identity import source_text, versions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.run_files import load_tensors, make_folder, save_tensors
 
@@ -96,7 +97,7 @@ def _checksum(segments: SegmentModel, *rest: Any) -> str:
         VERSION,
         versions(),
         source_text(segments.model),
-        file_text(segments.model),
+        code_checksum(segments.model),
         segments.channel_names,
         type(simulator).__qualname__,
         simulator.recorded_settings(),

@@ -14,6 +14,7 @@ from npdr_ppl.language.layers import layers
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import ModelWithWiderPriors, wider_sites
 from npdr_ppl.language.written_priors import written_prior
+from npdr_ppl.model_code import code_of
 from npdr_ppl.python_files import is_importable
 from npdr_ppl.python_text import plain, quoted
 
@@ -34,7 +35,8 @@ def revised_source(
     """Returns Python source that defines ``revised_model``.
 
     What an installed module defines is imported. A model from a file is copied, and so is what an
-    effect from a file needs of it, so that the result needs no other file.
+    effect from a file needs of it, so that the result needs no other file. Only a model that needs
+    the files beside its own is loaded from where it is.
 
     Args:
         model: The original model.
@@ -127,7 +129,19 @@ def _base(model: Model) -> tuple[str, str, Path | None]:
     if module is not None and is_importable(module.__name__):
         doc = f'"""{name} with the effects that it was missing."""'
         return f"{doc}\n\nfrom {module.__name__} import {name}", name, None
-    path = inspect.getsourcefile(model)
-    if path is None:
+    code = code_of(model)
+    if code.file is None:
         return f"# The source of {name} was not found: import it here.", name, None
-    return Path(path).read_text(encoding="utf-8"), name, Path(path)
+    if code.is_alone:
+        return code.file.read_text(encoding="utf-8"), name, code.file
+    lines = [
+        f'"""{name} with the effects that it was missing."""',
+        "",
+        "from pathlib import Path",
+        "",
+        "from npdr_ppl.cli.model_files import load_function",
+        "",
+        "# The model needs files beside its own, so it is loaded from where it is.",
+        f"{name} = load_function(Path({quoted(str(code.file.absolute()))}), {quoted(name)})",
+    ]
+    return "\n".join(lines), name, None

@@ -27,6 +27,7 @@ from torch import Tensor
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
 from npdr_ppl.loop.control_task import ControlTask
+from npdr_ppl.model_code import code_checksum
 from npdr_ppl.model_identity import source_text, versions
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.run_files import (
@@ -82,6 +83,7 @@ class LoopFolder:
             {
                 "format": FORMAT,
                 "model": source_text(model),
+                "code": code_checksum(model),
                 "target": repr(target),
                 "task": task.name,
                 "num_steps": task.num_steps,

@@ -32,6 +32,7 @@ from npdr_ppl.language.handlers import (
     with_noise,
 )
 from npdr_ppl.language.prior import Prior
+from npdr_ppl.model_code import code_checksum
 from npdr_ppl.model_identity import engine_settings, model_name, source_text, versions
 from npdr_ppl.posterior.estimator_check import Correction
 from npdr_ppl.posterior.prepare import Preparation
@@ -121,6 +122,7 @@ class RunFolder:
             "binding": _binding(bound),
             "seed": seed,
             "num_simulations": num_simulations,
+            "code": code_checksum(bound.model),
             "fingerprint": _fingerprint(bound.data),
             "features": _sketch(bound.observed_features()),
         }

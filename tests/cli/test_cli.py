@@ -125,6 +125,13 @@ def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, reco
     assert set(fit["parameters"]) == {"mass", "hinge.coulomb_friction.magnitude"}
     assert fit["noise"] is None, "the model's own noise is kept"
     assert sys.modules["json"] is json
+    # Results of a model are not shown as those of a corrected one.
+    file.write_text(file.read_text().replace("'mass': mass", "'mass': 2.0 * mass"))
+    code, _, err = run(
+        monkeypatch, capsys, "fit", f"{file}:heavy", "--data", recording, "--out", out,
+        "--effect", "hinge.coulomb_friction", "--rounds", 1, "--simulations", 100, "--quiet",
+    )  # fmt: skip
+    assert code == 2 and "differs in the model's code" in err
 
 
 @pytest.mark.slow
