@@ -1,8 +1,8 @@
 """The code that a model consists of, by which runs notice that it has changed.
 
-It is the part of the model's file that the model needs, the files beside it that this imports, and
-the files that it names, such as a robot's. Comments and whatever else the file has do not count, so
-that a script may be edited between two runs.
+It is the part of the model's file that the model needs, the files beside it that this imports,
+and the files that it names, such as a robot's. Comments and whatever else the file has do not
+count, so that a script may be edited between two runs.
 """
 
 import ast
@@ -61,7 +61,8 @@ def code_of(model: Any) -> ModelCode:
     neighbours = _with_neighbours(text, file.parent)
     words = {word for each in (text, *neighbours.values()) for word in _texts(each)}
     named = {word: path for word in words if (path := _file_named(word, file.parent))}
-    is_beside = any(path == file.parent / word for word, path in named.items() if _is_relative(word))
+    relative = {word: path for word, path in named.items() if not Path(word).is_absolute()}
+    is_beside = any(path == file.parent / word for word, path in relative.items())
     return ModelCode(
         file=file,
         text=text,
@@ -131,10 +132,6 @@ def _file_named(word: str, folder: Path) -> Path | None:
         return next((path for path in (folder / word, Path(word)) if path.is_file()), None)
     except (OSError, ValueError):  # too long, or a character that no path has
         return None
-
-
-def _is_relative(word: str) -> bool:
-    return not Path(word).is_absolute()
 
 
 def _read(file: Path) -> str:
