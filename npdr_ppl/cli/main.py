@@ -80,7 +80,7 @@ def main() -> None:
         sys.exit(exit_code())
     except _UsageError as error:
         where = error.ctx.command_path if error.ctx else "npdr"
-        _refuse(f"{_sentence(error.format_message())} See {where} --help.")
+        _refuse(f"{_sentence(error.format_message())}{_repeating(error)} See {where} --help.")
     except NpdrError as error:
         _refuse(str(error))
     except OSError as error:
@@ -118,6 +118,14 @@ def _run() -> Any:
         if isinstance(error.__context__, BrokenPipeError):  # `npdr ... | head` has read enough
             raise
         _refuse(f"The model or its simulator ended the program by sys.exit({error.code!r}).")
+
+
+def _repeating(error: Any) -> str:
+    """Returns how to give an option several values, if that was the mistake."""
+    is_extra = "unexpected extra argument" in error.format_message()
+    options = error.ctx.command.params if is_extra and error.ctx else ()
+    given = [o.opts[0] for o in options if getattr(o, "multiple", False) and o.opts[0] in sys.argv]
+    return f" Give {given[0]} before each of its values." if given else ""
 
 
 def _sentence(message: str) -> str:

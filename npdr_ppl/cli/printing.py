@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 __all__ = [
+    "UNITLESS",
     "WIDTH",
     "broken",
     "console_for_tables",
@@ -19,6 +20,12 @@ __all__ = [
 
 WIDTH = 100
 """Width in characters of a table that is written to a file or a pipe."""
+
+UNITLESS = (
+    "RMSE and DTW have no unit: each channel is divided by its largest measured value. The RMSE "
+    "is a mean over channels; the DTW distance is a sum over steps."
+)
+"""What the metrics of rollouts mean."""
 
 
 def console_for_tables() -> Console:

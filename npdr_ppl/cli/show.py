@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from npdr_ppl.cli.printing import (
+    UNITLESS,
     broken,
     console_for_tables,
     percent,
@@ -17,7 +18,7 @@ from npdr_ppl.cli.printing import (
     print_reason,
 )
 from npdr_ppl.cli.show_discovery import show_discovery
-from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.numbers import interval, number, uncertain
 
 __all__ = [
     "show_comparison",
@@ -55,10 +56,10 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
     for name, p in result["parameters"].items():
         table.add_row(
             escape(broken(name, width)),
-            f"{p['mean']:.4g}",
+            uncertain(p["mean"], p["sd"]),
             f"{p['sd']:.2g}",
-            f"{p['hdi_94'][0]:.4g} … {p['hdi_94'][1]:.4g}",
-            f"{result['most_likely'][name]:.4g}",
+            interval(p["hdi_94"]),
+            uncertain(result["most_likely"][name], p["sd"]),
             f"{contraction[name]:.0%}",
         )
     console.print(table)
@@ -66,8 +67,7 @@ def show_fit(result: Mapping[str, Any], out: Path) -> None:
     console.print(
         f"RMSE {number(metrics['rmse'])}, DTW {number(metrics['dtw'], '.4g')} on "
         f"{metrics['evaluated_on']} rollouts (most likely draw, simulated from the start of each "
-        "segment). Neither has a unit: each channel is divided by its largest measured value. The "
-        "RMSE is a mean over channels; the DTW distance is a sum over steps.",
+        f"segment). {UNITLESS}",
         highlight=False,
     )
     console.print(

@@ -9,10 +9,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from npdr_ppl.cli.printing import broken, console_for_tables, percent, print_notes, print_reason
+from npdr_ppl.cli.printing import (
+    UNITLESS,
+    broken,
+    console_for_tables,
+    percent,
+    print_notes,
+    print_reason,
+)
 from npdr_ppl.drawing.effect_names import why_unnamed
 from npdr_ppl.drawing.experiment_words import ranges_of_commands, values_that_differ
-from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.numbers import interval, number, uncertain
 
 __all__ = ["show_discovery"]
 
@@ -64,14 +71,13 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             name, probability = f"{row['effect']}\nat {row['port']}", percent(row["probability"])
             for parameter, p in row["parameters"].items():
                 unit = "" if p["unit"] in ("", "1") else f" [{p['unit']}]"
-                low, high = p["hdi_94"]
                 table.add_row(
                     escape("\n".join(broken(line, WIDEST_NAME) for line in name.split("\n"))),
                     escape(parameter + unit),
                     probability,
-                    number(p["mean"], ".4g"),
+                    uncertain(p["mean"], p["sd"]),
                     number(p["sd"], ".2g"),
-                    f"{number(low, '.3g')} … {number(high, '.3g')}",
+                    interval(p["hdi_94"], least=3),
                 )
                 name = probability = ""
             for constant, value in row.get("constants", {}).items():
@@ -107,6 +113,7 @@ def _show_findings(console: Console, found: Mapping[str, Any]) -> None:
             values = [number(gap[k], ".4g") for k in ("before", "after", "noise_floor")]
             table.add_row(metric, *values, number(gap["closed"], ".0%"))
         console.print(table)
+        console.print(UNITLESS, highlight=False)
     for site, values in (found.get("estimated_anew") or {}).items():
         searched, first, second = (f"{values[key]:.4g}" for key in ANEW)
         console.print(
@@ -148,12 +155,11 @@ def _show_parameters(console: Console, found: Mapping[str, Any]) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("unit", overflow="fold")
     for name, p in list(rows.items())[:MOST_PARAMETERS]:
-        low, high = p["hdi_94"]
         table.add_row(
             escape(broken(name, WIDEST_PARAMETER)),
-            number(p["mean"], ".4g"),
+            uncertain(p["mean"], p["sd"]),
             number(p["sd"], ".2g"),
-            f"{number(low, '.4g')} … {number(high, '.4g')}",
+            interval(p["hdi_94"]),
             "" if p["unit"] in ("", "1") else escape(p["unit"]),
         )
     console.print(table)

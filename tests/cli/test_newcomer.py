@@ -164,6 +164,10 @@ def test_a_mistake_in_a_command(monkeypatch, capsys, tmp_path, words, sentence):
         ),
         (["fit", "pendulum", "--rounds", "0"], "Invalid value for '--rounds': "),
         (["fit", "pendulum", "--segment-length"], "requires an argument."),
+        (
+            ["fit", "pendulum", "--data", "a.csv", "b.csv", "--out", "fit"],
+            "extra argument(s) (b.csv). Give --data before each of its values.",
+        ),
     ],
 )
 def test_a_mistake_in_an_option(monkeypatch, capsys, words, sentence):

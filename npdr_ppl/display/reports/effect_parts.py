@@ -19,7 +19,7 @@ from npdr_ppl.drawing.effect_names import (
     in_words,
     why_unnamed,
 )
-from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.numbers import interval, number, uncertain
 
 __all__ = ["effects_section", "estimates_section"]
 
@@ -71,7 +71,7 @@ def estimates_section(parameters: Mapping[str, Any]) -> list[Section]:
     rows = [
         [
             f"{name.replace('_', ' ')}{_unit(row)}",
-            number(row.get("mean"), ".4g"),
+            uncertain(row.get("mean"), row.get("sd")),
             number(row.get("sd"), ".2g"),
             _interval(row),
         ]
@@ -101,7 +101,7 @@ def _parameters(effects: Rows) -> list[Part]:
     rows = [
         [
             f"{_named(effect)}: {name.replace('_', ' ')}{_unit(row)}",
-            number(row.get("mean"), ".4g"),
+            uncertain(row.get("mean"), row.get("sd")),
             number(row.get("sd"), ".2g"),
             _interval(row),
         ]
@@ -122,7 +122,7 @@ def _repeated(effects: Rows) -> list[Part]:
         [
             f"{_named(effect)}: {name.replace('_', ' ')}",
             str(part.get("part")),
-            f"{number(value.get('mean'), '.4g')} ± {number(value.get('sd'), '.2g')}",
+            f"{uncertain(value.get('mean'), value.get('sd'))} ± {number(value.get('sd'), '.2g')}",
         ]
         for effect in effects
         for part in effect.get("parts") or []
@@ -208,4 +208,4 @@ def _unit(row: Mapping[str, Any]) -> str:
 
 
 def _interval(row: Mapping[str, Any]) -> str:
-    return " … ".join(number(bound, ".4g") for bound in row.get("hdi_94") or []) or "–"
+    return interval(row.get("hdi_94") or [])

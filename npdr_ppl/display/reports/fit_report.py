@@ -18,7 +18,7 @@ from npdr_ppl.display.reports.content import (
 from npdr_ppl.display.reports.meanings import decision_verdict, findings
 from npdr_ppl.display.reports.posterior_parts import posterior_charts, predictive_charts
 from npdr_ppl.display.reports.provenance import provenance_section, run_description, source_section
-from npdr_ppl.drawing.numbers import number
+from npdr_ppl.drawing.numbers import interval, number, uncertain
 from npdr_ppl.hdf5_checks import check_self_contained, named_netcdf
 from npdr_ppl.run_files import read_json
 from npdr_ppl.run_records import FitRecord
@@ -70,13 +70,13 @@ def parameters_table(
     rows = [
         [
             f"{label} [{unit}]" if unit and unit != "1" else label,
-            number(mean, ".4g"),
+            uncertain(mean, sd),
             number(sd, ".2g"),
-            f"{number(low, '.4g')} … {number(high, '.4g')}",
-            number(likely, ".4g"),
+            interval(bounds),
+            uncertain(likely, sd),
             number(contraction.get(label), ".0%"),
         ]
-        for unit, (label, mean, sd, (low, high), likely) in islice(elements, MAX_ROWS)
+        for unit, (label, mean, sd, bounds, likely) in islice(elements, MAX_ROWS)
     ]
     columns = ("parameter", "mean", "sd", "94 % interval", "most likely", "contraction")
     caption = "The interval contains 94 % of the posterior."
