@@ -6,13 +6,11 @@ weights are too unequal, the next proposal is a kernel density estimate of the w
 which follows curved ridges. The tail of the weights, fitted by Pareto smoothing, shows whether
 they are reliable (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 
-Where the draws are many enough for a polynomial of the log density, it takes the place of the
-proposals: Markov chains draw from it without a simulation, and their ends are weighted by the
-ratio of the two densities; see :mod:`npdr_ppl.preparation.density_surrogate`. This reaches the
-ends of ridges, to which proposals give too few draws. If no polynomial is close enough, an
-ensemble of the draws moves along the ridges by Markov chain Monte Carlo under the density itself.
-Neither is needed if Laplace's approximation with its heavy tails suffices: the posterior is then
-nearly normal in these coordinates, and the tails reach its ends.
+Where polynomials represent the residuals, draws need far fewer simulations; this is tried first,
+see :mod:`npdr_ppl.preparation.surrogate_sampling`. Otherwise, an ensemble of the draws moves along
+ridges by Markov chain Monte Carlo, because proposals give too few draws at their ends. That is
+not needed if Laplace's approximation with its heavy tails suffices: the posterior is then nearly
+normal in these coordinates, and the tails reach its ends.
 """
 
 import math
@@ -25,71 +23,19 @@ from torch import Tensor
 from npdr_ppl.inference.base import Density
 from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
-from npdr_ppl.inference.parts.samplers.walkers import LogDensity, ensemble_draws
+from npdr_ppl.inference.parts.samplers.walkers import ensemble_draws
 from npdr_ppl.preparation.density_surrogate import DensitySurrogate
-from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.ridges import RidgeCoordinates, log_density_of
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
+from npdr_ppl.preparation.surrogate_sampling import surrogate_draws
+from npdr_ppl.preparation.weighted_draws import WeightedDraws, effective_size, smoothed_weights
 from npdr_ppl.randomness import derived_seed, seeded
 
 __all__ = [
-    "WeightedDraws",
-    "effective_size",
-    "heavy_tailed",
     "laplace_draws",
     "sample_posterior",
-    "smoothed_weights",
 ]
-
-
-@dataclass(frozen=True)
-class WeightedDraws:
-    """Weighted draws of a posterior.
-
-    Attributes:
-        z: Reference coordinates, ``(n, d)``.
-        w: The same in coordinates in which ridges are straight, ``(n, d)``.
-        space: These coordinates.
-        log_weights: Logarithms of their weights, whose sum is one, ``(n,)``.
-        k_hat: Shape of the tail of the weights; reliable up to ``IMPORTANCE_SAMPLING.reliable_k``.
-        effective: Effective sample size of the importance sampling.
-        iterations: Iterations that were needed.
-    """
-
-    z: Tensor
-    w: Tensor
-    space: RidgeCoordinates
-    log_weights: Tensor
-    k_hat: float
-    effective: float
-    iterations: int
-
-    @property
-    def weights(self) -> Tensor:
-        """The weights, ``(n,)``."""
-        return self.log_weights.exp()
-
-    @property
-    def is_reliable(self) -> bool:
-        """Whether the draws represent the posterior."""
-        return (
-            self.k_hat <= IMPORTANCE_SAMPLING.reliable_k
-            and self.effective >= IMPORTANCE_SAMPLING.least_effective
-        )
-
-    @property
-    def has_enough(self) -> bool:
-        """Whether no more draws are needed."""
-        return (
-            self.k_hat <= IMPORTANCE_SAMPLING.reliable_k
-            and self.effective >= IMPORTANCE_SAMPLING.enough_effective
-        )
-
-    def moments(self) -> tuple[Tensor, Tensor]:
-        """Returns mean ``(d,)`` and covariance ``(d, d)``."""
-        mean = self.weights @ self.z
-        away = self.z - mean
-        return mean, (self.weights[:, None] * away).mT @ away
 
 
 @dataclass(frozen=True)
@@ -120,22 +66,6 @@ class _Proposal:
         return (log_density + math.log(self.num_draws)).nan_to_num(-math.inf, -math.inf, -math.inf)
 
 
-def heavy_tailed(mean: Tensor, covariance: Tensor) -> GaussianMixture:
-    """Returns a density around a point with heavier tails than a normal density.
-
-    Args:
-        mean: The point, ``(d,)``.
-        covariance: Covariance of the central component, ``(d, d)``.
-    """
-    weights, factors = (
-        torch.tensor(column, dtype=torch.float64)
-        for column in zip(*IMPORTANCE_SAMPLING.tails, strict=True)
-    )
-    return GaussianMixture.from_moments(
-        weights, mean.expand(len(weights), -1), factors[:, None, None] * covariance
-    )
-
-
 def sample_posterior(
     likelihood: SegmentLikelihood,
     proposals: Sequence[Density] = (),
@@ -159,14 +89,17 @@ def sample_posterior(
         most_iterations: Greatest number of proposals; that of the settings by default.
         report: Called with a short status after each proposal.
     """
+    if not is_rough:
+        led = surrogate_draws(likelihood, proposals, seed=seed, report=report)
+        if led is not None:
+            return led
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=is_rough)
     settings = IMPORTANCE_SAMPLING
-    own = [_Proposal(heavy_tailed(*space.moments()), settings.draws_per_iteration, space)]
+    own = [_Proposal(space.heavy_tailed(), settings.draws_per_iteration, space)]
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]
     z, w, target, log_mixture = (torch.empty(0, dtype=torch.float64) for _ in range(4))
     result: WeightedDraws | None = None
-    last_asked = 0
     for iteration in range(most_iterations or settings.most_iterations):
         with seeded(seed, "importance", iteration):
             new_w = own[-1].density.sample(settings.draws_per_iteration).double()
@@ -197,11 +130,6 @@ def sample_posterior(
         is_enough = result.has_enough
         if is_enough and (not space.num_weak or (iteration == 0 and not given)):
             break
-        # A polynomial that failed is not asked again before there are twice as many draws.
-        if not is_rough and len(z) >= 2 * last_asked:
-            last_asked = len(z)
-            if (led := _led(result, target, likelihood, seed)) is not None:
-                return led
         if is_enough:
             break
         if iteration + 1 >= settings.iterations_to_adapt and size < z.shape[1]:
@@ -235,78 +163,9 @@ def laplace_draws(likelihood: SegmentLikelihood, num: int, *, seed: int) -> Tens
     return z[inside]
 
 
-def _log_density(likelihood: SegmentLikelihood, space: RidgeCoordinates) -> LogDensity:
-    """Returns the posterior's log density over the coordinates w, up to a constant."""
-    prior = likelihood.segments.prior
-
-    def log_density(w: Tensor) -> Tensor:
-        z, inside = space.to_reference(w)
-        result = torch.full((len(w),), -torch.inf, dtype=torch.float64)
-        if bool(inside.any()):
-            at = z[inside]
-            result[inside] = likelihood.log_prob(at) + prior.log_prob(at) - space.log_jacobian(at)
-        return result.nan_to_num(-math.inf, -math.inf, -math.inf)
-
-    return log_density
-
-
 def _known(draws: WeightedDraws, target: Tensor) -> Tensor:
     """Returns the log density of draws over w, ``(n,)``, from that over reference coordinates."""
     return torch.where(target.isfinite(), target - draws.space.log_jacobian(draws.z), -torch.inf)
-
-
-def _led(
-    draws: WeightedDraws, target: Tensor, likelihood: SegmentLikelihood, seed: int
-) -> WeightedDraws | None:
-    """Returns draws of a polynomial in place of the log density, weighted by their ratio.
-
-    The polynomial is fitted to the draws so far, and again to its own draws where it was wrong.
-
-    Args:
-        draws: The draws so far.
-        target: Their log density over reference coordinates, ``(n,)``.
-        likelihood: The recording's likelihood.
-        seed: Seed of the draws.
-
-    Returns:
-        ``None`` if there is no polynomial, or its draws are too few effective ones.
-    """
-    settings, space = IMPORTANCE_SAMPLING, draws.space
-    log_density = _log_density(likelihood, space)
-    w, log_weights, known = draws.w, draws.log_weights, _known(draws, target)
-    for attempt in range(settings.polynomials):
-        surrogate = DensitySurrogate.of(w, log_weights, known)
-        if surrogate is None:
-            return None
-
-        def density(at: Tensor, polynomial: DensitySurrogate = surrogate) -> Tensor:
-            return torch.where(space.to_reference(at)[1], polynomial(at), -torch.inf)
-
-        with seeded(seed, "led", attempt):
-            first = w[systematic(log_weights, settings.num_walkers)]
-        made = ensemble_draws(
-            density,
-            first,
-            sweeps=settings.sweeps_led,
-            interval=settings.sweeps_led // 4,
-            generator=torch.Generator().manual_seed(derived_seed(seed, "led", attempt)),
-        )
-        values = log_density(made)
-        smoothed, k_hat = smoothed_weights(values - density(made))
-        found = WeightedDraws(
-            space.to_reference(made)[0],
-            made,
-            space,
-            smoothed,
-            k_hat,
-            effective_size(smoothed),
-            draws.iterations,
-        )
-        if found.has_enough:
-            return found
-        w, known = torch.cat((w, made)), torch.cat((known, values))
-        log_weights = torch.cat((log_weights, torch.full_like(smoothed, -torch.inf)))
-    return None
 
 
 def _moved(
@@ -327,7 +186,7 @@ def _moved(
     with seeded(seed, "walkers"):
         first = draws.w[systematic(draws.log_weights, settings.num_walkers)]
     w = ensemble_draws(
-        _log_density(likelihood, draws.space),
+        log_density_of(likelihood, draws.space),
         first,
         sweeps=settings.sweeps if surrogate else settings.sweeps_alone,
         interval=settings.sweeps_between_draws,
@@ -336,25 +195,6 @@ def _moved(
     )
     log_weights = torch.full((len(w),), -math.log(len(w)), dtype=torch.float64)
     return replace(draws, z=draws.space.to_reference(w)[0], w=w, log_weights=log_weights)
-
-
-def smoothed_weights(log_weights: Tensor) -> tuple[Tensor, float]:
-    """Returns Pareto-smoothed log weights, normalised, ``(n,)``, and the shape of their tail.
-
-    If too few draws have a positive weight, all weights are set equal and the shape is infinite.
-    """
-    from npdr_ppl.arviz_module import pareto_smoothed
-
-    smoothed, k_hat = pareto_smoothed(log_weights.numpy())
-    result = torch.from_numpy(smoothed)
-    if not bool(result.isfinite().any()):
-        result = torch.zeros(len(log_weights), dtype=torch.float64)
-    return result - result.logsumexp(0), k_hat
-
-
-def effective_size(log_weights: Tensor) -> float:
-    """Returns the effective sample size of log weights that sum to one."""
-    return float((-(2 * log_weights).logsumexp(0)).exp())
 
 
 def _adapted(y: Tensor, log_weights: Tensor, seed: int, iteration: int) -> GaussianMixture:

@@ -8,7 +8,7 @@ from itertools import combinations_with_replacement
 import torch
 from torch import Tensor
 
-__all__ = ["Polynomial", "fit_polynomial", "num_terms"]
+__all__ = ["Polynomial", "fit_polynomial", "monomials", "num_terms"]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Polynomial:
 
     def __call__(self, points: Tensor) -> Tensor:
         """Returns its values, ``(n, m)``, at points ``(n, k)``."""
-        return _monomials(points, self.degree) @ self.coefficients
+        return monomials(points, self.degree) @ self.coefficients
 
 
 def fit_polynomial(
@@ -70,7 +70,7 @@ def fit_polynomial(
         if points_per_coefficient * num_terms(points.shape[1], degree) > len(points):
             break
         left, sizes, right = torch.linalg.svd(
-            weight * _monomials(points, degree), full_matrices=False
+            weight * monomials(points, degree), full_matrices=False
         )
         projected = left.mT @ wanted
         for penalty in penalties:
@@ -91,16 +91,7 @@ def num_terms(number: int, degree: int) -> int:
     return math.comb(number + degree, degree)
 
 
-def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:
-    """Returns the variables whose product is each monomial, the constant first."""
-    return [
-        chosen
-        for power in range(degree + 1)
-        for chosen in combinations_with_replacement(range(number), power)
-    ]
-
-
-def _monomials(values: Tensor, degree: int) -> Tensor:
+def monomials(values: Tensor, degree: int) -> Tensor:
     """Returns all monomials of ``(n, k)`` variables up to a degree, ``(n, terms)``."""
     columns: list[Tensor] = []
     known: dict[tuple[int, ...], Tensor] = {(): torch.ones(len(values), dtype=torch.float64)}
@@ -109,3 +100,12 @@ def _monomials(values: Tensor, degree: int) -> Tensor:
             known[chosen] = known[chosen[:-1]] * values[:, chosen[-1]]
         columns.append(known[chosen])
     return torch.stack(columns, dim=-1)
+
+
+def _exponents(number: int, degree: int) -> list[tuple[int, ...]]:
+    """Returns the variables whose product is each monomial, the constant first."""
+    return [
+        chosen
+        for power in range(degree + 1)
+        for chosen in combinations_with_replacement(range(number), power)
+    ]

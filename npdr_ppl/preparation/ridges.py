@@ -21,15 +21,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.inference.parts.samplers.importance_weights import longest_step
+from npdr_ppl.inference.parts.samplers.walkers import LogDensity
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.preparation.polynomials import Polynomial, fit_polynomial, num_terms
 from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.settings import RIDGE
+from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, RIDGE
 from npdr_ppl.randomness import seeded
 
-__all__ = ["RidgeCoordinates"]
+__all__ = ["RidgeCoordinates", "log_density_of"]
 
 
 @dataclass(frozen=True)
@@ -78,16 +80,15 @@ class RidgeCoordinates:
         scaled = known * (spread / slope)[:, None] * (spread / slope)
         information, vectors = torch.linalg.eigh(0.5 * (scaled + scaled.mT))
         information = information.clamp_min(0.0)
-        # Along a direction of width δ the ridge departs from a line by about δ², in units of the
-        # prior. The direction can be weak if that exceeds the width of the stiffest one.
-        can_be_weak = 0 if is_rough else int((information**2 < information[-1]).sum())
+        can_be_weak = 0 if is_rough else _num_weak(information)
         basis = spread[:, None] * vectors
         centre = space.from_reference(_most_likely(likelihood, known)[None])[0]
         straight = cls._straight(space, centre, basis, information, 0)
         is_weak = torch.zeros(len(z), dtype=torch.bool)
         is_weak[:can_be_weak] = True
         if 0 < can_be_weak < len(z):
-            is_weak[:can_be_weak] = straight._most_curved(likelihood, can_be_weak)
+            density = log_density_of(likelihood, straight)
+            is_weak[:can_be_weak] = straight._most_curved(density, can_be_weak)
         order = torch.cat((is_weak.nonzero()[:, 0], (~is_weak).nonzero()[:, 0]))
         num_weak = int(is_weak.sum())
         found = cls._straight(
@@ -117,37 +118,61 @@ class RidgeCoordinates:
             torch.diag(1.0 / (1.0 + information[:num_weak])),
         )
 
-    def _most_curved(self, likelihood: SegmentLikelihood, num: int) -> Tensor:
+    def bent_along(
+        self, w: Tensor, log_density: Tensor, density: LogDensity
+    ) -> "RidgeCoordinates":
+        """Returns straight coordinates with a polynomial through draws of the posterior.
+
+        Args:
+            w: The draws in these coordinates, ``(n, d)``.
+            log_density: Their log density up to a constant, ``(n,)``.
+            density: The log density over w, which may cost nothing.
+        """
+        can_be_weak = _num_weak(self.information)
+        is_weak = torch.zeros(len(self.centre), dtype=torch.bool)
+        if 0 < can_be_weak < len(is_weak):
+            is_weak[:can_be_weak] = self._most_curved(density, can_be_weak)
+        num_weak = int(is_weak.sum())
+        if num_weak in (0, len(is_weak)):
+            return self
+        order = torch.cat((is_weak.nonzero()[:, 0], (~is_weak).nonzero()[:, 0]))
+        found = self._straight(
+            self.space, self.centre, self.basis[:, order], self.information[order], num_weak
+        )._bent_through(w[:, order], log_density)
+        weak = w[:, order[:num_weak]]
+        return replace(found, weak_mean=weak.mean(0), weak_covariance=weak.mT.cov())
+
+    def _most_curved(self, log_density: LogDensity, num: int) -> Tensor:
         """Returns along which of the first coordinates the posterior is most curved, ``(num,)``.
 
         They are ``RIDGE.most_weak`` at most, because the number of points of a ridge grows with
         the square of theirs. Curvature is seen near the closest fit only.
 
         Args:
-            likelihood: The recording's likelihood.
+            log_density: The posterior's log density over w.
             num: Number of the coordinates.
         """
         axes = torch.eye(num, dtype=torch.float64)
-        missed = self._missed(likelihood, axes)
+        missed = self._missed(log_density, axes)
         straight = (missed <= RIDGE.straight_gain).nonzero()[:, 0]
         if num - len(straight) < RIDGE.most_weak and len(straight) > 1:
             # A ridge can be curved between two coordinates along each of which it is straight.
             first, second = straight[torch.triu_indices(len(straight), len(straight), 1)]
-            between = self._missed(likelihood, (axes[first] + axes[second]) / 2.0**0.5)
+            between = self._missed(log_density, (axes[first] + axes[second]) / 2.0**0.5)
             for members in (first, second):
                 missed = missed.scatter_reduce(0, members, between, "amax")
         is_curved = torch.zeros(num, dtype=torch.bool)
         is_curved[missed.argsort(descending=True)[: RIDGE.most_weak]] = True
         return is_curved & (missed > RIDGE.straight_gain)
 
-    def _missed(self, likelihood: SegmentLikelihood, directions: Tensor) -> Tensor:
+    def _missed(self, log_density: LogDensity, directions: Tensor) -> Tensor:
         """Returns by how much a normal posterior is wrong at two standard deviations, ``(n,)``.
 
         It is the difference of log densities, the mean of both sides, because a slope is no
         curvature. It is infinite where both sides are outside the prior's support.
 
         Args:
-            likelihood: The recording's likelihood.
+            log_density: The posterior's log density over w.
             directions: Directions among the first k coordinates, in standard deviations,
                 ``(n, k)``.
         """
@@ -155,14 +180,7 @@ class RidgeCoordinates:
         away = 2.0 * torch.cat((directions, -directions))
         w = torch.zeros(len(away) + 1, len(self.centre), dtype=torch.float64)
         w[1:, :num] = away / (1.0 + self.information[:num]).sqrt()
-        z, inside = self.to_reference(w)
-        density = torch.full((len(w),), torch.nan, dtype=torch.float64)
-        at = z[inside]
-        density[inside] = (
-            likelihood.log_prob(at)
-            + likelihood.segments.prior.log_prob(at).double()
-            - self.log_jacobian(at)
-        )
+        density = torch.where(self.to_reference(w)[1], log_density(w), torch.nan)
         normal = -0.5 * away.square().sum(-1)
         missed = (density[1:] - density[0] - normal).unflatten(0, (2, -1)).nanmean(0)
         return missed.abs().nan_to_num(torch.inf, torch.inf, torch.inf)
@@ -203,6 +221,17 @@ class RidgeCoordinates:
         mean[:k], covariance[:k, :k] = self.weak_mean, self.weak_covariance
         return mean, covariance
 
+    def heavy_tailed(self) -> GaussianMixture:
+        """Returns a density over w with these moments at its centre and heavy tails."""
+        mean, covariance = self.moments()
+        weights, factors = (
+            torch.tensor(column, dtype=torch.float64)
+            for column in zip(*IMPORTANCE_SAMPLING.tails, strict=True)
+        )
+        return GaussianMixture.from_moments(
+            weights, mean.expand(len(weights), -1), factors[:, None, None] * covariance
+        )
+
     def from_reference(self, z: Tensor) -> Tensor:
         """Maps reference coordinates ``(n, d)`` to w."""
         away = self.space.from_reference(z) - self.centre
@@ -220,6 +249,10 @@ class RidgeCoordinates:
         """Returns log |∂w/∂z|, ``(n,)``."""
         own = self.space.log_jacobian(z, self.space.from_reference(z))
         return own - torch.linalg.slogdet(self.basis).logabsdet
+
+    def log_prior(self, z: Tensor) -> Tensor:
+        """Returns the prior's log density over w, ``(n,)``, at reference coordinates."""
+        return self.space.prior.log_prob(z).double() - self.log_jacobian(z)
 
     def _traced(
         self, likelihood: SegmentLikelihood, slope: Tensor, seed: int
@@ -327,6 +360,29 @@ class RidgeCoordinates:
             points_per_coefficient=RIDGE.points_per_coefficient,
         )
         return self if bend is None else replace(self, bend=bend)
+
+
+def log_density_of(likelihood: SegmentLikelihood, space: RidgeCoordinates) -> LogDensity:
+    """Returns the posterior's log density over the coordinates w, up to a constant."""
+
+    def log_density(w: Tensor) -> Tensor:
+        z, inside = space.to_reference(w)
+        result = torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        if bool(inside.any()):
+            at = z[inside]
+            result[inside] = likelihood.log_prob(at) + space.log_prior(at)
+        return result.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
+
+    return log_density
+
+
+def _num_weak(information: Tensor) -> int:
+    """Returns along how many directions a ridge may be curved; the information is ascending.
+
+    Along a direction of width δ the ridge departs from a line by about δ², in units of the prior.
+    The direction can be weak if that exceeds the width of the stiffest one.
+    """
+    return int((information**2 < information[-1]).sum())
 
 
 def _most_likely(likelihood: SegmentLikelihood, information: Tensor) -> Tensor:

@@ -122,6 +122,19 @@ class SegmentLikelihood:
         result = -0.5 * self.share * (squares / self.variance + constant)
         return torch.where(result.isfinite(), result, -torch.inf)
 
+    def whitened(self, z: Tensor) -> Tensor:
+        """Returns residuals q whose log density is −½ |q|² up to a constant, ``(n, S N)``.
+
+        q = (w/v)^½ C^−½ r in float64 at points ``(n, d)``; not finite where a simulation fails.
+        """
+        left, sizes, _ = torch.linalg.svd(self.linearisation.by_starts, full_matrices=False)
+        shrunk = (1.0 + sizes.square()).rsqrt() - 1.0
+        found = []
+        for residual in self._residuals(z):
+            towards = shrunk * torch.einsum("snm,bsn->bsm", left, residual)
+            found.append((residual + torch.einsum("snm,bsm->bsn", left, towards)).flatten(1))
+        return math.sqrt(self.share / self.variance) * torch.cat(found)
+
     def information(self) -> Tensor:
         """Returns the Fisher information of the parameters at the closest fit, ``(d, d)``."""
         return self.share * self.linearisation.information() / self.variance

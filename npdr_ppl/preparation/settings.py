@@ -16,6 +16,7 @@ __all__ = [
     "LINEARISATION",
     "LINEAR_REGRESSION",
     "PRIOR_SEARCH",
+    "RESIDUAL_SURROGATE",
     "RIDGE",
     "SAMPLING_COORDINATES",
     "SEGMENT_FIT",
@@ -26,6 +27,7 @@ __all__ = [
     "LinearRegressionSettings",
     "LinearisationSettings",
     "PriorSearchSettings",
+    "ResidualSurrogateSettings",
     "RidgeSettings",
     "SamplingCoordinateSettings",
     "SegmentFitSettings",
@@ -306,10 +308,7 @@ class ImportanceSamplingSettings:
             (Vehtari et al. 2024).
         enough_effective: Effective sample size at which sampling ends. The ends of a 90 % interval
             are then known to a tenth of a standard deviation.
-        polynomials: Number of times that a polynomial is fitted in place of the log density.
-        sweeps_led: Number of moves of each walker under the polynomial, which cost no simulation.
-        num_walkers: Number of draws that move as an ensemble, under the polynomial or along a
-            ridge.
+        num_walkers: Number of draws that move as an ensemble along a ridge.
         sweeps: Number of moves of each; a surrogate leads most of them. On one Furuta pendulum
             (seed 1075 of ``benchmarks/discovery.py``), standard deviations after 8 were 2 %
             smaller than after 60.
@@ -330,8 +329,6 @@ class ImportanceSamplingSettings:
     iterations_to_adapt: int = 8
     reliable_k: float = 0.7
     enough_effective: float = 200.0
-    polynomials: int = 2
-    sweeps_led: int = 200
     num_walkers: int = 256
     sweeps: int = 8
     sweeps_alone: int = 30
@@ -347,12 +344,77 @@ class ImportanceSamplingSettings:
         check_range(self, 1, math.inf, "draws_per_iteration", "most_iterations", "num_kernels")
         check_range(self, 1, math.inf, "iterations_to_adapt")
         check_range(self, 1, math.inf, "sweeps", "sweeps_alone", "sweeps_between_draws")
-        check_range(self, 1, math.inf, "polynomials", "sweeps_led")
         check_range(self, 4, math.inf, "num_walkers")
         check_range(self, 1, math.inf, "enough_effective", "least_effective", "draws_of_given")
         check_range(self, 0.0, 1.0, "reliable_k")
         check_range(self, 1.0, math.inf, "effective_per_parameter")
         check_range(self, 0.0, math.inf, "tails")
+
+
+@dataclass(frozen=True)
+class ResidualSurrogateSettings:
+    """Polynomials in place of the residuals.
+
+    Attributes:
+        fewest_first: Least number of simulations before the first fit.
+        most_first: Greatest number; a recording of more parameters is sampled without polynomials.
+        most_bytes: Most memory for the residuals of all simulations.
+        draw_factor: Number of draws for each first simulation; those outside the prior's support
+            are dropped.
+        points_per_term: Number of points for each term of a quadratic, to which polynomials are
+            fitted at least; of more, only the more likely half is used, or those that are near.
+        near: Difference of the log density from the greatest up to which points are near, in units
+            of the number of parameters. Draws of a normal density have half of it on average.
+        most_degree: Greatest degree of the polynomials.
+        penalties: Penalties of squared coefficients, per point, of which the one with the smallest
+            leave-one-out error is taken.
+        least_penalty: Penalty in the information about the coefficients, which keeps it regular.
+        inside_share: Share of the points of a fit with a smaller leverage than the farther ones.
+            While polynomials are far off, draws are kept from going beyond.
+        widest_reach: Greatest leverage of draws under polynomials that are not far off, in units
+            of that of the farther points. With ten, draws may be 1.8 times as far from the middle.
+        tested: Number of draws under the polynomials that are simulated to test them.
+        most_fits: Greatest number of fits.
+        least_share: Effective share of the tested draws from which the polynomials can be used.
+        enough_share: Effective share from which further fits would not pay.
+        margin: Factor of the number of draws beyond what the tested ones predict.
+        unlikely_share: Share of the draws that are less likely than a draw of a mode.
+        even_share: Effective share of the points at which chains begin.
+        num_walkers: Number of chains.
+        sweeps: Number of moves of each.
+    """
+
+    fewest_first: int = 128
+    most_first: int = 2048
+    most_bytes: int = 256 * 2**20
+    draw_factor: int = 20
+    points_per_term: float = 1.1
+    near: float = 3.0
+    most_degree: int = 4
+    penalties: tuple[float, ...] = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+    least_penalty: float = 1e-6
+    inside_share: float = 0.9
+    widest_reach: float = 10.0
+    tested: int = 128
+    most_fits: int = 8
+    least_share: float = 0.2
+    enough_share: float = 0.5
+    margin: float = 1.1
+    unlikely_share: float = 0.1
+    even_share: float = 0.1
+    num_walkers: int = 256
+    sweeps: int = 200
+
+    def __post_init__(self) -> None:
+        """Checks the values; raises ``ValueError``."""
+        check_range(self, 1, math.inf, "fewest_first", "most_first", "most_bytes", "draw_factor")
+        check_range(self, 1.0, 100.0, "points_per_term", "margin", "widest_reach")
+        check_range(self, 0.0, math.inf, "near", "penalties", "least_penalty")
+        check_range(self, 1, 10, "most_degree")
+        check_range(self, 0.0, 1.0, "least_share", "enough_share", "even_share")
+        check_range(self, 0.0, 1.0, "unlikely_share", "inside_share")
+        check_range(self, 1, math.inf, "tested", "most_fits", "sweeps")
+        check_range(self, 4, math.inf, "num_walkers")
 
 
 @dataclass(frozen=True)
@@ -431,6 +493,7 @@ INITIAL_STATES = InitialStateSettings()
 SAMPLING_COORDINATES = SamplingCoordinateSettings()
 RIDGE = RidgeSettings()
 IMPORTANCE_SAMPLING = ImportanceSamplingSettings()
+RESIDUAL_SURROGATE = ResidualSurrogateSettings()
 DENSITY_SURROGATE = DensitySurrogateSettings()
 DRAW_BUDGET = DrawBudgetSettings()
 LINEAR_REGRESSION = LinearRegressionSettings()

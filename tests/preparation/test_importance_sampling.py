@@ -17,7 +17,7 @@ from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.importance_sampling import sample_posterior
 from npdr_ppl.preparation.polynomials import Polynomial
-from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.ridges import RidgeCoordinates, log_density_of
 from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
 from tests.helpers.pendulum_recordings import product, swinging
 
@@ -150,7 +150,8 @@ def test_a_log_normal_parameter_is_sampled_by_its_logarithm():
 def test_of_many_weak_coordinates_the_most_curved_are_traced(ridge):
     space = RidgeCoordinates.of(ridge, seed=0)
     straight = replace(space, bend=Polynomial.zero(2))
-    assert straight._most_curved(ridge, 2).tolist() == [True, False]
+    density = log_density_of(ridge, straight)
+    assert straight._most_curved(density, 2).tolist() == [True, False]
 
 
 def test_coordinates_along_a_ridge_and_back(ridge):

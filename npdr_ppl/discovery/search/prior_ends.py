@@ -6,7 +6,7 @@ with the fit at their ends are widened and the model is fitted again.
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, fit_segment_model
 from npdr_ppl.discovery.search.settings import PRIOR_ENDS
-from npdr_ppl.discovery.search.trials import Trials
+from npdr_ppl.discovery.search.trials import Trials, refit
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.model import Model
 from npdr_ppl.language.wider_priors import (
@@ -33,6 +33,7 @@ __all__ = [
     "beyond",
     "own_priors_suffice",
     "widen_where_it_helps",
+    "with_wider_effects",
     "with_widest_priors",
 ]
 
@@ -144,6 +145,40 @@ def with_widest_priors(
     return current, frozenset(names)
 
 
+def with_wider_effects(
+    trials: Trials, current: Hypothesis, *, is_trial: bool = False
+) -> Hypothesis:
+    """Widens priors of effects' strengths that have a fit at an end, if it then fits better.
+
+    How strong a missing effect is, its prior cannot know. If the prior ends before, another effect
+    explains the rest. Shapes keep their priors: an implausible one shows that a law is wrong.
+
+    Args:
+        trials: Fits the model.
+        current: The closest fit of the model with effects.
+        is_trial: Whether a short fit is enough.
+    """
+    for _ in range(PRIOR_ENDS.most_widenings):
+        at_end = set(_at_end(current, near=PRIOR_ENDS.outside_coordinate))
+        effects, asked = [], set[str]()
+        for effect in current.effects:
+            own = [p.name for p in effect.strengths if f"{effect.name}.{p.name}" in at_end]
+            port = current.simulator.port(effect.port)
+            effects.append(effect.with_wider_priors(port, own) if own else effect)
+            asked.update(own)
+        if not asked:
+            break
+        segments = trials.with_effects(tuple(effects), current.segments.starts)
+        if segments is None:
+            break
+        fit = replace(refit(segments, current, tuple(effects), {}), is_trial=is_trial)
+        (fitted,) = trials.fits([fit], current.simulator)
+        if fitted is None or _gain(current, fitted) < _threshold(asked):
+            break
+        current = fitted
+    return current
+
+
 def _refitted(
     current: Hypothesis,
     model: Model,
@@ -175,15 +210,20 @@ def _threshold(names: Collection[str]) -> float:
     return 0.5 * float(stats.chi2.isf(PRIOR_ENDS.false_alarm_rate, len(names)))
 
 
-def _at_end(hypothesis: Hypothesis) -> list[str]:
-    """Returns the scalar sites whose fit is near an end that a wider prior would move."""
+def _at_end(hypothesis: Hypothesis, *, near: float = PRIOR_ENDS.near_coordinate) -> list[str]:
+    """Returns the scalar sites whose fit is near an end that a wider prior would move.
+
+    Args:
+        hypothesis: The fit.
+        near: Absolute reference coordinate from which a parameter is near an end.
+    """
     z, found = hypothesis.fit.z, []
     for site in hypothesis.segments.prior.sites:
         if site.shape.numel() != 1:
             continue
         place = float(z[site.coordinates][0])
         prior = hypothesis.segments.prior.distributions[site.name]
-        is_near = abs(place) > PRIOR_ENDS.near_coordinate and widened(prior) is not None
+        is_near = abs(place) > near and widened(prior) is not None
         if is_near and _is_movable(prior, is_lower=place < 0.0):
             found.append(site.name)
     return found

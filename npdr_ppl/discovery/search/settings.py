@@ -131,17 +131,20 @@ class PriorEndSettings:
             value as too narrow.
         outside_probability: A value is outside its prior if the prior probability beyond it is at
             most this.
+        outside_coordinate: The same of an effect's strength. A strong effect often is in the
+            outermost 5 % of its prior, and each fit with wider priors costs time.
         most_widenings: Greatest number of times that priors are widened, each time threefold.
     """
 
     near_coordinate: float = 1.64
     false_alarm_rate: float = 1e-3
     outside_probability: float = 1e-3
+    outside_coordinate: float = 3.0
     most_widenings: int = 3
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
-        check_range(self, 0.0, 10.0, "near_coordinate")
+        check_range(self, 0.0, 10.0, "near_coordinate", "outside_coordinate")
         check_range(self, 0.0, 1.0, "false_alarm_rate", "outside_probability")
         check_range(self, 0, 100, "most_widenings")
 

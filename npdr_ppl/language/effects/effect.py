@@ -3,7 +3,7 @@
 import copy
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import ClassVar, Self
 
@@ -15,6 +15,7 @@ from torch.distributions import Distribution, HalfNormal
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Parameter, Port, PortKind
 from npdr_ppl.language.effect_context import EquivalenceClass, Excitation
+from npdr_ppl.language.wider_priors import widened
 
 __all__ = ["Effect", "upper_end"]
 
@@ -177,6 +178,17 @@ class Effect(ABC):
             if isinstance(prior, HalfNormal)
         }
         return self._with_further_priors(signed)
+
+    def with_wider_priors(self, port: Port, names: Collection[str]) -> Self:
+        """Returns the effect with wider priors of some parameters; see :func:`widened`.
+
+        Args:
+            port: The port it attaches to.
+            names: The parameters; those with other kinds of priors keep them.
+        """
+        own = self.priors(port)
+        wider = {name: widened(own[name]) for name in names}
+        return self._with_further_priors({n: p for n, p in wider.items() if p is not None})
 
     def _with_further_priors(self, priors: Mapping[str, Distribution]) -> Self:
         """Returns a copy with further priors; the effect itself if there are none."""

@@ -1,0 +1,192 @@
+"""Draws of a posterior with polynomials in place of the simulator.
+
+Simulations around the closest fit give polynomials for a recording's whitened residuals; see
+:mod:`~npdr_ppl.preparation.residual_surrogate`. Markov chains draw from the posterior that
+follows, without further simulations. Some of these draws are simulated, and weighted by the ratio
+of the densities. While the weights are too unequal, these simulations join the others, and the
+polynomials are fitted again: they become right where the posterior is.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from npdr_ppl.inference.base import Density
+from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, systematic
+from npdr_ppl.inference.parts.samplers.walkers import LogDensity, ensemble_draws
+from npdr_ppl.preparation.polynomials import num_terms
+from npdr_ppl.preparation.residual_surrogate import ResidualSurrogate
+from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
+from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, RESIDUAL_SURROGATE
+from npdr_ppl.preparation.weighted_draws import WeightedDraws, effective_size, smoothed_weights
+from npdr_ppl.randomness import derived_seed, seeded
+
+__all__ = ["surrogate_draws"]
+
+
+def surrogate_draws(
+    likelihood: SegmentLikelihood,
+    given: Sequence[Density] = (),
+    *,
+    seed: int,
+    report: Callable[[str], None] = lambda _: None,
+) -> WeightedDraws | None:
+    """Draws from the posterior of a recording with polynomials in place of its residuals.
+
+    Args:
+        likelihood: The recording's likelihood.
+        given: Densities over reference coordinates that may be posteriors; some of their draws
+            are simulated, to see whether the polynomials leave out a mode.
+        seed: Seed of the draws.
+        report: Called with a short status after each fit of the polynomials.
+
+    Returns:
+        ``None`` if polynomials do not represent the residuals, or leave out a mode, or if they
+        would take too much memory.
+    """
+    settings, d = RESIDUAL_SURROGATE, len(likelihood.fit.z)
+    num_first = max(settings.fewest_first, math.ceil(1.25 * num_terms(d, 2)))
+    num_most = num_first + settings.most_fits * settings.tested
+    num_bytes = 4 * num_most * likelihood.linearisation.residual.numel()
+    if num_first > settings.most_first or num_bytes > settings.most_bytes:
+        return None
+    space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=True)
+    mean, covariance = space.moments()
+    scale = covariance.diagonal().sqrt()
+    simulated = _Simulated(likelihood, space)
+    with seeded(seed, "surrogate"):
+        w = space.heavy_tailed().sample(settings.draw_factor * num_first).double()
+        drawn = [density.sample(settings.tested).double().cpu() for density in given]
+    simulated.add(w[space.to_reference(w)[1]][:num_first])
+    if not len(simulated.w):
+        return None
+    others = torch.cat([simulated.w[:0], *map(space.from_reference, drawn)])
+    values_of_others = simulated.add(others)
+    reach = settings.widest_reach
+    for attempt in range(settings.most_fits):
+        fitted = ResidualSurrogate.of(
+            simulated.w, simulated.gram(), simulated.log_density, mean, scale
+        )
+        if fitted is None:
+            return None
+        density = _posterior(space, fitted, reach)
+        own_seed = derived_seed(seed, "surrogate", attempt)
+        made = _made(simulated, density, own_seed)
+        made = made[torch.randperm(len(made), generator=torch.Generator().manual_seed(own_seed))]
+        w = made[: settings.tested]
+        values = simulated.add(w)
+        smoothed, k_hat = smoothed_weights(values - density(w))
+        share = effective_size(smoothed) / len(w) if math.isfinite(k_hat) else 0.0
+        report(f"{len(simulated.w)} draws, polynomials {share:.0%} effective")
+        is_close = k_hat <= IMPORTANCE_SAMPLING.reliable_k and share >= settings.least_share
+        is_last = attempt + 1 == settings.most_fits
+        is_wide = reach == settings.widest_reach
+        reach = settings.widest_reach if is_close else 1.0
+        if not (is_close and is_wide) or (share < settings.enough_share and not is_last):
+            continue
+        number = math.ceil(IMPORTANCE_SAMPLING.enough_effective / share * settings.margin)
+        further = made[settings.tested : max(number, settings.tested)]
+        w, values = torch.cat((w, further)), torch.cat((values, simulated.add(further)))
+        smoothed, k_hat = smoothed_weights(values - density(w))
+        found = WeightedDraws.of(w, space, smoothed, k_hat, attempt + 1)
+        # Other draws that are as likely, but do not occur under the polynomials.
+        is_likely = values_of_others > values.quantile(settings.unlikely_share)
+        if bool((is_likely & (density(others) < density(w).min())).any()):
+            return None
+        if found.has_enough:
+            return found.along(space.bent_along(w, values, density))
+    return None
+
+
+class _Simulated:
+    """Points of a posterior that were simulated.
+
+    Args:
+        likelihood: The recording's likelihood.
+        space: Coordinates of the points.
+
+    Attributes:
+        w: The points, ``(n, d)``.
+        log_density: Their log density over w up to a constant, ``(n,)``.
+    """
+
+    def __init__(self, likelihood: SegmentLikelihood, space: RidgeCoordinates) -> None:
+        self._likelihood, self._space = likelihood, space
+        self._residuals: list[Tensor] = []
+        self._gram = torch.empty(0, 0, dtype=torch.float64)
+        self.w = torch.empty(0, len(space.centre), dtype=torch.float64)
+        self.log_density = torch.empty(0, dtype=torch.float64)
+
+    def add(self, w: Tensor) -> Tensor:
+        """Simulates points ``(m, d)``; returns their log density, minus infinity where it fails.
+
+        Points where a simulation fails are not kept.
+        """
+        values = torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        z, inside = self._space.to_reference(w) if len(w) else (w, torch.empty(0).bool())
+        if not bool(inside.any()):
+            return values
+        residuals = self._likelihood.whitened(z[inside])
+        prior = self._space.log_prior(z[inside])
+        found = (prior - 0.5 * residuals.square().sum(-1)).nan_to_num(-torch.inf, -torch.inf)
+        values[inside] = found
+        is_known = found.isfinite()
+        # Single precision suffices for polynomials, and halves the memory.
+        self._residuals.append(residuals[is_known].float())
+        self._gram = self._extended_gram()
+        self.w = torch.cat((self.w, w[inside][is_known]))
+        self.log_density = torch.cat((self.log_density, found[is_known]))
+        return values
+
+    def gram(self) -> Tensor:
+        """Returns the products of the points' residuals, ``(n, n)``."""
+        return self._gram
+
+    def _extended_gram(self) -> Tensor:
+        """Returns the products with the newest points among them."""
+        new = self._residuals[-1].double()
+        across = torch.cat([part.double() @ new.mT for part in self._residuals])
+        before = len(self._gram)
+        result = torch.zeros(len(across), len(across), dtype=torch.float64)
+        result[:before, :before] = self._gram
+        result[:, before:] = across
+        result[before:] = across.mT
+        return result
+
+
+def _posterior(space: RidgeCoordinates, fitted: ResidualSurrogate, reach: float) -> LogDensity:
+    """Returns the log density over w that follows from polynomials and the prior.
+
+    Args:
+        space: The coordinates w.
+        fitted: The polynomials.
+        reach: How far from the points of their fit they are trusted.
+    """
+
+    def log_density(w: Tensor) -> Tensor:
+        result = torch.full((len(w),), -torch.inf, dtype=torch.float64)
+        z, inside = space.to_reference(w) if len(w) else (w, torch.empty(0).bool())
+        if bool(inside.any()):
+            result[inside] = fitted(w[inside], reach) + space.log_prior(z[inside])
+        return result.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
+
+    return log_density
+
+
+def _made(simulated: _Simulated, density: LogDensity, seed: int) -> Tensor:
+    """Returns draws of a density by Markov chains, which begin at simulated points."""
+    settings = RESIDUAL_SURROGATE
+    # If few points have most of the weight, chains begin at more of them.
+    exponent = longest_step(simulated.log_density, 1.0, settings.even_share)
+    with seeded(seed, "first"):
+        first = simulated.w[systematic(exponent * simulated.log_density, settings.num_walkers)]
+    return ensemble_draws(
+        density,
+        first,
+        sweeps=settings.sweeps,
+        interval=settings.sweeps // 4,
+        generator=torch.Generator().manual_seed(seed),
+    )
