@@ -41,7 +41,7 @@ def test_polynomials_are_not_trusted_far_from_the_points_of_their_fit():
     near, far = torch.tensor([[0.5, 0.1]]).double(), torch.tensor([[20.0, 120.0]]).double()
     surrogate = fitted(60)
     assert surrogate(near).isfinite() and surrogate(far) == -torch.inf
-    assert surrogate(far, 1e6).isfinite()
+    assert surrogate(far, 1e12).isfinite()
 
 
 def test_too_few_points_have_no_polynomials():
