@@ -5,7 +5,7 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -109,6 +109,7 @@ def effects(
             "summary": effect.law or _first_line(effect),
             "attaches to": list(effect.port_kinds),
             "parameters": [f"{p.name} [{_unit(p.unit)}]" for p in effect.parameters],
+            "priors at rated values of 1": _priors(effect),
             "may be confused with": [c.name for c in effect.equivalence],
             "revealed by": effect.excitation,
         }
@@ -119,6 +120,16 @@ def effects(
         if effect in files:
             row["file"] = files[effect]
     _show("effects", rows, name, as_json)
+
+
+def _priors(effect: Any) -> list[str]:
+    """Returns the priors of an effect's parameters at a port whose rated values are all one."""
+    from npdr_ppl.language.channels import Port
+    from npdr_ppl.language.wider_priors import described_prior
+
+    kind = effect.port_kinds[0]
+    priors = effect("port").default_priors(Port("port", kind, "1"))
+    return [f"{name}: {described_prior(prior)}" for name, prior in priors.items()]
 
 
 def _change_effects(add: Path | None, remove: str, as_json: bool) -> None:

@@ -179,10 +179,13 @@ def _posterior(space: RidgeCoordinates, fitted: ResidualSurrogate, reach: float)
 def _made(simulated: _Simulated, density: LogDensity, seed: int) -> Tensor:
     """Returns draws of a density by Markov chains, which begin at simulated points."""
     settings = RESIDUAL_SURROGATE
+    # The points of the fit are among those where the polynomials are known.
+    is_known = density(simulated.w).isfinite()
+    w, known = simulated.w[is_known], simulated.log_density[is_known]
     # If few points have most of the weight, chains begin at more of them.
-    exponent = longest_step(simulated.log_density, 1.0, settings.even_share)
+    exponent = longest_step(known, 1.0, settings.even_share)
     with seeded(seed, "first"):
-        first = simulated.w[systematic(exponent * simulated.log_density, settings.num_walkers)]
+        first = w[systematic(exponent * known, settings.num_walkers)]
     return ensemble_draws(
         density,
         first,

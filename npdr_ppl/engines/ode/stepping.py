@@ -233,5 +233,9 @@ def _drive_forces(
         return first, (a * gained[1] - c * gained[0]) / determinant
     size = gained[0].shape
     rows = [torch.stack([entry.expand(size) for entry in row], dim=-1) for row in inertia]
-    matrix = torch.stack(rows, dim=-2)
-    return torch.linalg.solve(matrix, torch.stack(gained, dim=-1)).unbind(-1)
+    matrix, wanted = torch.stack(rows, dim=-2), torch.stack(gained, dim=-1)
+    try:
+        return torch.linalg.solve(matrix, wanted).unbind(-1)
+    except torch.linalg.LinAlgError:
+        # Positions that depend on each other, as a heading on two wheels: the least forces.
+        return (torch.linalg.pinv(matrix) @ wanted[..., None])[..., 0].unbind(-1)
