@@ -72,6 +72,7 @@ class ResidualSurrogate:
             residuals,
             weights=weights,
             importance=torch.ones(residuals.shape[1], dtype=torch.float64),
+            least_degree=2,
             most_degree=settings.most_degree,
             points_per_coefficient=1,
             penalties=settings.penalties,

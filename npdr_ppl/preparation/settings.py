@@ -398,7 +398,7 @@ class ResidualSurrogateSettings:
     tested: int = 128
     most_fits: int = 8
     least_share: float = 0.2
-    enough_share: float = 0.5
+    enough_share: float = 0.4
     margin: float = 1.1
     unlikely_share: float = 0.1
     even_share: float = 0.1

@@ -64,7 +64,7 @@ def surrogate_draws(
     if not len(simulated.w):
         return None
     others = torch.cat([simulated.w[:0], *map(space.from_reference, drawn)])
-    values_of_others = simulated.add(others)
+    values_of_others, _ = simulated.simulate(others)
     reach = settings.widest_reach
     for attempt in range(settings.most_fits):
         fitted = ResidualSurrogate.of(
@@ -96,7 +96,7 @@ def surrogate_draws(
         is_likely = values_of_others > values.quantile(settings.unlikely_share)
         if bool((is_likely & (density(others) < density(w).min())).any()):
             return None
-        if found.has_enough:
+        if found.is_reliable:
             return found.along(space.bent_along(w, values, density))
     return None
 
@@ -120,25 +120,36 @@ class _Simulated:
         self.w = torch.empty(0, len(space.centre), dtype=torch.float64)
         self.log_density = torch.empty(0, dtype=torch.float64)
 
-    def add(self, w: Tensor) -> Tensor:
-        """Simulates points ``(m, d)``; returns their log density, minus infinity where it fails.
+    def simulate(self, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the log density of points ``(m, d)``, and residuals where it is finite.
 
-        Points where a simulation fails are not kept.
+        It is minus infinity outside the prior's support and where a simulation fails.
         """
         values = torch.full((len(w),), -torch.inf, dtype=torch.float64)
-        z, inside = self._space.to_reference(w) if len(w) else (w, torch.empty(0).bool())
+        inside = torch.zeros(len(w), dtype=torch.bool)
+        if len(w):
+            z, inside = self._space.to_reference(w)
         if not bool(inside.any()):
-            return values
+            return values, torch.empty(0, dtype=torch.float64)
         residuals = self._likelihood.whitened(z[inside])
         prior = self._space.log_prior(z[inside])
         found = (prior - 0.5 * residuals.square().sum(-1)).nan_to_num(-torch.inf, -torch.inf)
         values[inside] = found
-        is_known = found.isfinite()
-        # Single precision suffices for polynomials, and halves the memory.
-        self._residuals.append(residuals[is_known].float())
-        self._gram = self._extended_gram()
-        self.w = torch.cat((self.w, w[inside][is_known]))
-        self.log_density = torch.cat((self.log_density, found[is_known]))
+        return values, residuals[found.isfinite()]
+
+    def add(self, w: Tensor) -> Tensor:
+        """Simulates points ``(m, d)`` and keeps them; returns their log density.
+
+        Points where it is not finite are not kept.
+        """
+        values, residuals = self.simulate(w)
+        is_known = values.isfinite()
+        if bool(is_known.any()):
+            # Single precision suffices for polynomials, and halves the memory.
+            self._residuals.append(residuals.float())
+            self._gram = self._extended_gram()
+            self.w = torch.cat((self.w, w[is_known]))
+            self.log_density = torch.cat((self.log_density, values[is_known]))
         return values
 
     def gram(self) -> Tensor:

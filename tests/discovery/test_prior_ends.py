@@ -1,5 +1,6 @@
 """Priors that end too early: which parameters are beyond their ends, and what is said of them."""
 
+import math
 from types import SimpleNamespace
 
 import pyro
@@ -10,12 +11,18 @@ import torch
 import npdr_ppl as npdr
 from npdr_ppl.discovery.hypothesis import fit_hypothesis
 from npdr_ppl.discovery.search.original_model import OriginalModel
-from npdr_ppl.discovery.search.prior_ends import PriorEnd, beyond, widen_where_it_helps
+from npdr_ppl.discovery.search.prior_ends import (
+    PriorEnd,
+    beyond,
+    widen_where_it_helps,
+    with_wider_effects,
+)
 from npdr_ppl.discovery.search.settings import PRIOR_ENDS
+from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.discovery.segment_options import segment_options
 from npdr_ppl.language.handlers import num_finer_steps, with_finer_steps
 from npdr_ppl.language.wider_priors import wider_sites, with_wider_priors
-from npdr_ppl.models.effects import Bias
+from npdr_ppl.models.effects import Bias, CoulombFriction
 from npdr_ppl.models.pendulum import Pendulum, pendulum
 from npdr_ppl.preparation.segment_model import SegmentModel
 from tests.helpers.pendulum_recordings import TRUTH, swinging, too_short
@@ -117,6 +124,21 @@ def test_a_prior_that_excludes_the_fit_is_widened(recording):
     assert float(priors["length"].high) == pytest.approx(0.75 + 0.45)
     # A parameter in the middle of its prior keeps it.
     assert float(priors["idle"].high) == 1.0
+
+
+@pytest.mark.parametrize(("scale", "is_widened"), [(0.02, True), (0.2, False)])
+def test_the_strength_of_an_effect_is_not_cut_off_by_its_prior(scale, is_widened):
+    rubbed = swinging(rollouts=1, steps=160, friction=0.3)
+    friction = CoulombFriction("hinge", priors={"magnitude": dist.HalfNormal(scale)})
+    trials = Trials(fitted(exact(1.7), rubbed).segments)
+    current = trials.refitted(fitted(exact(1.7), rubbed), (friction,))
+    found = with_wider_effects(trials, current)
+    assert (found is not current) == is_widened
+    assert float(found.parameters[friction.parameter_names[0]]) == pytest.approx(0.3, rel=0.03)
+    (own,) = found.effects
+    widenings = math.log(float(own.given_priors["magnitude"].scale) / scale, 3.0)
+    assert widenings == pytest.approx(round(widenings), abs=1e-6)
+    assert 1 <= round(widenings) <= PRIOR_ENDS.most_widenings if is_widened else widenings < 0.1
 
 
 def exact(longest):
