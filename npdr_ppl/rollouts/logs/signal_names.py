@@ -33,8 +33,8 @@ _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
     (
         "position",
         re.compile(
-            r"(^|[^a-z])(positions?|pos|qpos|q|angle|theta|alpha|phi|encoder|height|observation[._]state|"
-            r"pose|deg)([^a-z]|$)"
+            r"(^|[^a-z])(positions?|pos|qpos|q|angle|theta|alpha|phi|enc|encoder|height|yaw|heading|"
+            r"observation[._]state|pose|deg)([^a-z]|$)"
         ),
     ),
 )
