@@ -31,7 +31,8 @@ STEPS: Mapping[str, tuple[str, Tone, str]] = {
     "named": (
         "use the revised model",
         "good",
-        "revised_model.py has the effects and is a MODEL for every command.",
+        "revised_model.py has the effects and is a MODEL for every command; logs need the same "
+        "--mapping.",
     ),
     "ambiguous": (
         "record again",
