@@ -83,8 +83,9 @@ def code_checksum(model: Any) -> str:
     digest = hashlib.sha256()
     for text in (code.text, *code.neighbours.values(), *map(described, effects)):
         digest.update(text.encode())
-    for file in code.named:
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    for path in code.named:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 

@@ -2,9 +2,9 @@
 
 Fits take most of a search's time, and are deterministic. Inside a block of :func:`keep_fits`, each
 finished fit is written to a file whose name is a checksum of all that the fit depends on. The same
-search then reads it, takes the same decisions, and gives the same result. A changed file of the
-model makes new fits. Changes in modules that this file imports are not noticed; delete the folder
-of fits after such a change.
+search then reads it, takes the same decisions, and gives the same result. Changed code
+of the model makes new fits. Changes in installed modules that it imports are not noticed; delete
+the folder of fits after such a change.
 """
 
 import hashlib
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import fields
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.model_code import code_checksum
-from npdr_ppl.model_identity import source_text, versions
+from npdr_ppl.model_identity import source_text, unwrapped, versions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.run_files import load_tensors, make_folder, save_tensors
 
@@ -87,6 +87,12 @@ def made_or_read(
     return made
 
 
+@lru_cache(maxsize=8)
+def _code(base: Any) -> str:
+    """Returns the checksum of a model without layers, whose code a process loads once."""
+    return code_checksum(base)
+
+
 def _checksum(segments: SegmentModel, *rest: Any) -> str:
     """Returns a checksum of all that tensors depend on."""
     simulator, prior = segments.simulator, segments.prior
@@ -97,7 +103,7 @@ def _checksum(segments: SegmentModel, *rest: Any) -> str:
         VERSION,
         versions(),
         source_text(segments.model),
-        code_checksum(segments.model),
+        _code(unwrapped(segments.model)[0]),
         segments.channel_names,
         type(simulator).__qualname__,
         simulator.recorded_settings(),
