@@ -5,7 +5,6 @@ from dataclasses import replace
 
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.search.evidence import closest, evidence, log_evidence
-from npdr_ppl.discovery.search.prior_ends import with_wider_effects
 from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.discovery.search.trials import Fit, Trials, refit
 from npdr_ppl.preparation.closest_fit import part_of
@@ -129,7 +128,6 @@ def converge_along_best(
         (best,) = trials.fits([_whole(trials, tried[first], current, starts)], current.simulator)
     if starts is None or best is None or not best.can_be_linearised:
         return converge_likeliest(trials, tried, current, progress=progress)
-    best = with_wider_effects(trials, best)
     # Where a joint sticks, there are several minima; from the same offsets, alike laws end in the
     # same one.
     offsets = best.fit.offsets
@@ -161,7 +159,7 @@ def _fitted(
     fits = trials.fits(list(asked.values()), trials.base.simulator)
     for number, (name, fit) in enumerate(zip(asked, fits, strict=True), num_done + 1):
         if fit is not None:
-            found[name] = with_wider_effects(trials, fit)
+            found[name] = fit
         progress(number / num, f"{number} of {num} best fits converged")
     return found
 

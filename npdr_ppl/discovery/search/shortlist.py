@@ -10,7 +10,6 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.groups import Group
 from npdr_ppl.discovery.screening.screening import Screened
 from npdr_ppl.discovery.search.evidence import closest, log_evidence
-from npdr_ppl.discovery.search.prior_ends import with_wider_effects
 from npdr_ppl.discovery.search.settings import TRIALS
 from npdr_ppl.discovery.search.trials import Trials
 from npdr_ppl.preparation.closest_fit import part_of
@@ -152,8 +151,7 @@ def _fit_each(
                 found.setdefault(candidate.name, []).append(trial)
         for candidate in present:
             if candidate.name in found:
-                best = _best(found[candidate.name])
-                tried[candidate.name] = with_wider_effects(trials, best, is_trial=True)
+                tried[candidate.name] = _best(found[candidate.name])
                 report(f"tried {candidate.name}: {_shown(tried[candidate.name])}")
             done += 1
             fitted(done)

@@ -1,7 +1,7 @@
 """Trials: fits of the original model with different sets of effects to the recording."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -9,7 +9,8 @@ from torch import Tensor
 
 from npdr_ppl.discovery.hypothesis import Hypothesis, extended, fit_segment_model
 from npdr_ppl.discovery.screening.repetition import keeps_in_step
-from npdr_ppl.discovery.search.settings import TRIALS
+from npdr_ppl.discovery.search.fits_at_ends import gain, threshold, with_wider_strengths
+from npdr_ppl.discovery.search.settings import PRIOR_ENDS, TRIALS
 from npdr_ppl.discovery.side_by_side import num_processes, side_by_side
 from npdr_ppl.errors import NpdrError
 from npdr_ppl.language.effects import Effect
@@ -219,7 +220,11 @@ class Trials:
     def fits(
         self, asked: Sequence[Fit | None], simulator: Simulator
     ) -> Iterator[Hypothesis | None]:
-        """Yields the hypothesis of each fit, ``None`` where the model cannot be simulated."""
+        """Yields the hypothesis of each fit, ``None`` where the model cannot be simulated.
+
+        The priors of effects' strengths are widened where the fit is at their end, if it then fits
+        better.
+        """
         possible = [fit for fit in asked if fit is not None]
         found = side_by_side(_fitted, possible, num_processes(simulator))
         for fit in asked:
@@ -227,11 +232,30 @@ class Trials:
             if fit is None or result is None:
                 yield None
                 continue
-            hypothesis = Hypothesis(fit.segments.model, fit.effects, fit.segments, result.fit)
-            hypothesis.keep_difference(result.difference)
-            if result.linearisation is not None:
-                hypothesis.keep_linearisation(result.linearisation)
-            yield hypothesis
+            hypothesis = result.hypothesis(fit)
+            yield hypothesis if fit.held else self._in_wide_priors(hypothesis, fit)
+
+    def _in_wide_priors(self, current: Hypothesis, asked: Fit) -> Hypothesis:
+        """Returns a fit with wider priors of strengths at their ends, if these help.
+
+        Args:
+            current: The fit with the present priors.
+            asked: Its arguments.
+        """
+        for _ in range(PRIOR_ENDS.most_widenings):
+            effects, sites = with_wider_strengths(current)
+            segments = self.with_effects(effects, current.segments.starts) if sites else None
+            if segments is None:
+                break
+            again = replace(refit(segments, current, effects, {}), is_trial=asked.is_trial)
+            result = _fitted(again)
+            if result is None:
+                break
+            wide = result.hypothesis(again)
+            if gain(current, wide) < threshold(sites):
+                break
+            current = wide
+        return current
 
 
 def refit(
@@ -259,6 +283,14 @@ class _Fitted:
     fit: SegmentFit
     difference: Tensor
     linearisation: Linearisation | None
+
+    def hypothesis(self, asked: Fit) -> Hypothesis:
+        """Returns the fitted model with all that is known of it."""
+        found = Hypothesis(asked.segments.model, asked.effects, asked.segments, self.fit)
+        found.keep_difference(self.difference)
+        if self.linearisation is not None:
+            found.keep_linearisation(self.linearisation)
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Leaves out the linearisation, which the asking process computes again if it needs it."""
