@@ -234,8 +234,8 @@ def _drive_forces(
     size = gained[0].shape
     rows = [torch.stack([entry.expand(size) for entry in row], dim=-1) for row in inertia]
     matrix, wanted = torch.stack(rows, dim=-2), torch.stack(gained, dim=-1)
-    try:
-        return torch.linalg.solve(matrix, wanted).unbind(-1)
-    except torch.linalg.LinAlgError:
+    found, is_singular = torch.linalg.solve_ex(matrix, wanted)
+    if bool(is_singular.any()):
         # Positions that depend on each other, as a heading on two wheels: the least forces.
-        return (torch.linalg.pinv(matrix) @ wanted[..., None])[..., 0].unbind(-1)
+        found = (torch.linalg.pinv(matrix) @ wanted[..., None])[..., 0]
+    return found.unbind(-1)
