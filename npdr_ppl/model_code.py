@@ -6,17 +6,21 @@ count, so that a script may be edited between two runs.
 """
 
 import ast
+import functools
 import hashlib
 import inspect
 import sys
 import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
 from npdr_ppl.excerpts import excerpt
-from npdr_ppl.model_identity import described, unwrapped
+from npdr_ppl.language.effects import Effect
+from npdr_ppl.model_identity import unwrapped
+from npdr_ppl.python_files import class_file, class_name, is_importable, loaded_files
 
 __all__ = ["ModelCode", "code_checksum", "code_of"]
 
@@ -48,17 +52,12 @@ def code_of(model: Any) -> ModelCode:
     Args:
         model: A Pyro model, possibly inside layers and handlers.
     """
-    base, _ = unwrapped(model)
-    definition = base if inspect.isroutine(base) else type(base)
-    # Of a function inside another one, the outer one is a part of the file.
-    name = definition.__qualname__.partition(".")[0]
     try:
-        file = Path(inspect.getsourcefile(definition) or "")
-        needed = excerpt(_read(file), {name})
-    except (OSError, TypeError, ValueError):
+        file, names = _place(unwrapped(model)[0])
+        text = _needed(file, names)
+    except (OSError, TypeError):
         return ModelCode()
-    text = _plain("\n".join([*needed.imports, needed.body]))
-    neighbours = _with_neighbours(text, file.parent)
+    neighbours = _neighbours(text, file.parent)
     words = {word for each in (text, *neighbours.values()) for word in _texts(each)}
     named = {word: path for word in words if (path := _file_named(word, file.parent))}
     relative = {word: path for word, path in named.items() if not Path(word).is_absolute()}
@@ -67,7 +66,7 @@ def code_of(model: Any) -> ModelCode:
         file=file,
         text=text,
         neighbours=neighbours,
-        named=tuple(sorted(named.values())),
+        named=tuple(sorted(set(named.values()))),
         is_alone=not (neighbours or is_beside or "__file__" in text),
     )
 
@@ -81,7 +80,7 @@ def code_checksum(model: Any) -> str:
     code = code_of(model)
     _, effects = unwrapped(model)
     digest = hashlib.sha256()
-    for text in (code.text, *code.neighbours.values(), *map(described, effects)):
+    for text in (code.text, *code.neighbours.values(), *map(_code_of_effect, effects)):
         digest.update(text.encode())
     for path in code.named:
         with path.open("rb") as file:
@@ -89,40 +88,86 @@ def code_checksum(model: Any) -> str:
     return digest.hexdigest()
 
 
-def _with_neighbours(text: str, folder: Path) -> dict[Path, str]:
+def _place(model: Any) -> tuple[Path, set[str]]:
+    """Returns the file that defines a model, and the model's top-level names in it.
+
+    Raises:
+        OSError: There is no such file.
+        TypeError: There is none.
+    """
+    definition = inspect.unwrap(model)
+    while isinstance(definition, functools.partial):
+        definition = inspect.unwrap(definition.func)
+    if not inspect.isroutine(definition):
+        definition = type(definition)
+    # What a factory made, or an instance of a class, has its arguments where it has its name.
+    for module in (sys.modules.get(definition.__module__), *loaded_files()):
+        names = {name for name, value in list(vars(module or object).items()) if value is model}
+        file = getattr(module, "__file__", None)
+        if names and file:
+            return Path(file), names
+    # Of a function inside another one, the outer one is a part of the file.
+    name = definition.__qualname__.partition(".")[0]
+    return Path(inspect.getsourcefile(definition) or ""), {name}
+
+
+def _needed(file: Path, names: set[str]) -> str:
+    """Returns the part of a file that names need; all of it if it does not define them."""
+    text = _read(file)
+    try:
+        needed = excerpt(text, names)
+    except (SyntaxError, ValueError):
+        return text
+    return _plain("\n".join([*needed.imports, needed.body]) if needed.body else text)
+
+
+def _code_of_effect(effect: Effect) -> str:
+    """Returns an effect's arguments, and the code of its class if a user's file defines it."""
+    own = type(effect)
+    file = None if is_importable(own.__module__) else class_file(own)
+    return repr(effect) if file is None else f"{effect!r}\n{_needed(file, {class_name(own)})}"
+
+
+def _neighbours(text: str, folder: Path) -> dict[Path, str]:
     """Returns the code of the files in a folder that code imports, directly or through others."""
     found: dict[Path, str] = {}
     waiting = [text]
     while waiting:
-        for module in _imported(waiting.pop()):
-            file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
-            is_beside = folder in (file.parent, file.parent.parent) and file.suffix == ".py"
-            for each in _of_module(file) if is_beside else ():
-                if each not in found:
-                    found[each] = _plain(_read(each))
-                    waiting.append(found[each])
-    return found
+        for module in sorted(_imported(waiting.pop())):
+            for file in _files_of(module, folder):
+                if file not in found:
+                    found[file] = _plain(_read(file))
+                    waiting.append(found[file])
+    return dict(sorted(found.items()))
 
 
-def _of_module(file: Path) -> list[Path]:
-    """Returns the files of a module, all of those of a package."""
-    return sorted(file.parent.rglob("*.py")) if file.stem == "__init__" else [file]
+def _files_of(module: str, folder: Path) -> list[Path]:
+    """Returns the Python files of a module in a folder, all of those of a package."""
+    spec = PathFinder.find_spec(module) or PathFinder.find_spec(module, [str(folder)])
+    # In the folder of installed packages, all of these would be neighbours.
+    if spec is None or folder.name in ("site-packages", "dist-packages"):
+        return []
+    packages = [Path(place) for place in spec.submodule_search_locations or ()]
+    if packages:
+        return sorted(f for p in packages if p.parent == folder for f in p.rglob("*.py"))
+    file = Path(spec.origin or "")
+    return [file] if file.parent == folder and file.suffix == ".py" else []
 
 
 def _imported(text: str) -> set[str]:
     """Returns the first parts of the names of the modules that code imports."""
     names = set()
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(_parsed(text)):
         if isinstance(node, ast.Import):
             names |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             names.add(node.module.partition(".")[0])
     return names
 
 
 def _texts(text: str) -> Iterator[str]:
     """Yields the texts that code has in quotation marks."""
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(_parsed(text)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
 
@@ -136,10 +181,21 @@ def _file_named(word: str, folder: Path) -> Path | None:
 
 
 def _read(file: Path) -> str:
-    with tokenize.open(file) as opened:
-        return opened.read()
+    try:
+        with tokenize.open(file) as opened:
+            return opened.read()
+    except (SyntaxError, UnicodeDecodeError):
+        return file.read_bytes().decode(errors="replace")
 
 
 def _plain(text: str) -> str:
-    """Returns code without comments, in one layout."""
-    return ast.unparse(ast.parse(text))
+    """Returns code without comments, in one layout; other texts as they are."""
+    return ast.unparse(_parsed(text)) or text
+
+
+def _parsed(text: str) -> ast.Module:
+    """Returns the statements of code, none of a text that is no code, such as a template's."""
+    try:
+        return ast.parse(text)
+    except (SyntaxError, ValueError):
+        return ast.Module([], [])

@@ -23,6 +23,7 @@ __all__ = [
     "class_name",
     "is_importable",
     "load_python_file",
+    "loaded_files",
     "neighbours_of",
     "own_names",
 ]
@@ -85,6 +86,11 @@ def load_python_file(path: Path) -> ModuleType:
         raise ModelError(f"{path} cannot be loaded: {type(error).__name__}: {error}.") from error
     setattr(module, _TEXT, text)
     return module
+
+
+def loaded_files() -> list[ModuleType]:
+    """Returns the modules of the Python files that are loaded."""
+    return [module for module in list(sys.modules.values()) if hasattr(module, _TEXT)]
 
 
 @contextmanager

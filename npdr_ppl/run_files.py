@@ -44,7 +44,7 @@ IN_WORDS = {
     "code": "the model's code or a file that it names",
     "features": "what is read from the data or the model",
     "fingerprint": "the data",
-    "model": "the model's source",
+    "name": "the model's name, or what is attached to it",
     "num_simulations": "the number of simulations",
     "num_steps": "the number of steps",
 }

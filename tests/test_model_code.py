@@ -1,5 +1,7 @@
 """The code of a model: what it needs of its file, of the files beside it and of those it names."""
 
+import os
+import subprocess
 import sys
 
 import pytest
@@ -81,6 +83,129 @@ def checksum_after(folder, name, old, new):
 def test_a_change_counts_where_the_model_needs_it(folder, name, old, new, counts):
     before = code_checksum(load_function(folder / "own.py", "own"))
     assert (checksum_after(folder, name, old, new) != before) == counts
+
+
+@pytest.mark.parametrize("module", ["npdr_code_space", "npdr_code_package"])
+def test_packages_beside_a_model_count_with_all_their_files(folder, module):
+    package = folder / module
+    package.mkdir()
+    if module == "npdr_code_package":
+        (package / "__init__.py").write_text("")
+    (package / "plant.py").write_text(NEIGHBOUR)
+    (package / "template.py").write_text("class {{ name }}:\n")
+    file = folder / "own.py"
+    file.write_text(file.read_text().replace("npdr_code_neighbour", f"{module}.plant"))
+    before = code_checksum(load_function(file, "own"))
+    assert checksum_after(folder, f"{module}/plant.py", "__init__", "reset") != before
+    assert checksum_after(folder, f"{module}/template.py", "name", "title") != before
+
+
+def test_the_checksum_is_the_same_in_every_process(folder):
+    for number in range(4):
+        (folder / f"npdr_code_{number}.py").write_text(f"VALUE = {number}\n")
+    imports = "\n".join(f"import npdr_code_{number}" for number in range(4))
+    uses = ", ".join(f"npdr_code_{number}.VALUE" for number in range(4))
+    file = folder / "many.py"
+    file.write_text(
+        f"{imports}\n\n\ndef own(inputs):\n    import npdr_code_neighbour\n    {uses}\n"
+    )
+    program = (
+        "import sys; from pathlib import Path; from npdr_ppl.cli.model_files import load_function;"
+        "from npdr_ppl.model_code import code_checksum;"
+        "print(code_checksum(load_function(Path(sys.argv[1]), 'own')))"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", program, str(file)],
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True,
+            check=True,
+            text=True,
+        ).stdout
+        for seed in ("1", "2", "3")
+    }
+    assert len(found) == 1
+
+
+MADE = """
+import functools
+
+from npdr_code_neighbour import Plant
+
+
+class Model:
+    def __init__(self, scale):
+        self.scale = scale
+
+    def __call__(self, inputs):
+        return self.scale
+
+
+def make(scale):
+    def model(inputs):
+        return scale
+    return model
+
+
+def logged(function):
+    @functools.wraps(function)
+    def inner(*args):
+        return function(*args)
+    return inner
+
+
+@logged
+def decorated(inputs):
+    return 2.0
+
+
+made = make(2.0)
+instance = Model(2.0)
+part = functools.partial(Model(1.0), inputs=2.0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("made", "make(2.0)", "make(3.0)"),
+        ("instance", "= Model(2.0)", "= Model(3.0)"),
+        ("part", "inputs=2.0", "inputs=3.0"),
+        ("part", "Model(1.0)", "Model(3.0)"),
+        ("decorated", "return 2.0", "return 3.0"),
+        ("decorated", "function(*args)", "function(args)"),
+    ],
+)
+def test_arguments_and_decorators_of_models_count(folder, name, old, new):
+    file = folder / "made.py"
+    file.write_text(MADE)
+    before = code_checksum(load_function(file, name))
+    file.write_text(MADE.replace(old, new))
+    assert code_checksum(load_function(file, name)) != before
+    file.write_text(MADE.replace("class Model", "# a comment\nclass Model"))
+    assert code_checksum(load_function(file, name)) == before
+
+
+EFFECT = """
+from npdr_ppl.models.effects import CoulombFriction
+
+UNUSED = 1
+
+
+class Own(CoulombFriction):
+    title = "own"
+"""
+
+
+def test_of_an_effect_its_class_counts(folder):
+    def checksum(text):
+        (folder / "own_effect.py").write_text(text)
+        effect = load_function(folder / "own_effect.py", "Own")("hinge")
+        return code_checksum(npdr.add_effect(pendulum, effect))
+
+    before = checksum(EFFECT)
+    assert checksum(EFFECT.replace('"own"', '"other"')) != before
+    assert checksum(EFFECT.replace("UNUSED = 1", "# unused")) == before
 
 
 def test_effects_count_but_not_the_noise():

@@ -87,10 +87,7 @@ class DiscoveryFolder:
         description = plain(
             {
                 "command": "discover",
-                "model": {
-                    "name": model_name(model),
-                    "source": source_text(model),
-                },
+                "name": model_name(model),
                 "code": code_checksum(model),
                 "options": settings,
                 "seed": seed,
@@ -100,7 +97,8 @@ class DiscoveryFolder:
         file = self.path / "run.json"
         make_folder(self.path)
         if not holds_this_run(file, description):
-            write_json(file, description | {"versions": versions()})
+            source = {"name": model_name(model), "source": source_text(model)}
+            write_json(file, description | {"versions": versions(), "model": source})
 
     def finished(self, stage: Stage) -> dict[str, Any] | None:
         """Returns the results up to a stage, or ``None`` if the folder does not have them."""

@@ -2,9 +2,8 @@
 
 Fits take most of a search's time, and are deterministic. Inside a block of :func:`keep_fits`, each
 finished fit is written to a file whose name is a checksum of all that the fit depends on. The same
-search then reads it, takes the same decisions, and gives the same result. Changed code
-of the model makes new fits. Changes in installed modules that it imports are not noticed; delete
-the folder of fits after such a change.
+search then reads it, takes the same decisions, and gives the same result. Changes in installed
+modules that a model imports are not noticed; delete the folder of fits after such a change.
 """
 
 import hashlib
@@ -12,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import fields
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,8 +19,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.model_code import code_checksum
-from npdr_ppl.model_identity import source_text, unwrapped, versions
+from npdr_ppl.model_identity import source_text, versions
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.run_files import load_tensors, make_folder, save_tensors
 
@@ -33,30 +31,35 @@ Result = TypeVar("Result")
 VERSION = 10
 """Raised when fits end elsewhere than before, so that those of earlier versions are not read."""
 
-_FOLDER: ContextVar[Path | None] = ContextVar("kept_fits", default=None)
+_KEPT: ContextVar[tuple[Path | None, str]] = ContextVar("kept_fits", default=(None, ""))
+"""The folder of fits, and the checksum of the model's code."""
 
 
 @contextmanager
-def keep_fits(folder: Path | None) -> Iterator[None]:
+def keep_fits(folder: Path | None, code: str = "") -> Iterator[None]:
     """Writes each fit inside the block to a folder, and reads those that are there.
 
     Args:
         folder: The folder, which is created if there is none; nothing is kept if it is ``None``.
+        code: Checksum of the model's code; see :func:`npdr_ppl.model_code.code_checksum`. Fits of
+            other code in the folder are not read.
     """
-    token = _FOLDER.set(folder)
+    token = _KEPT.set((folder, code))
     try:
         yield
     finally:
-        _FOLDER.reset(token)
+        _KEPT.reset(token)
 
 
 def keeping(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
     """Returns a function that keeps its fits in this process's folder, in any process."""
-    return partial(_kept, function, _FOLDER.get())
+    return partial(_kept, function, *_KEPT.get())
 
 
-def _kept(function: Callable[[Item], Result], folder: Path | None, item: Item) -> Result:
-    with keep_fits(folder):
+def _kept(
+    function: Callable[[Item], Result], folder: Path | None, code: str, item: Item
+) -> Result:
+    with keep_fits(folder, code):
         return function(item)
 
 
@@ -75,22 +78,16 @@ def made_or_read(
     Raises:
         OSError: The tensors cannot be written.
     """
-    folder = _FOLDER.get()
+    folder, code = _KEPT.get()
     if folder is None:
         return make()
-    file = folder / f"{_checksum(segments, *rest)[:32]}.safetensors"
+    file = folder / f"{_checksum(segments, code, *rest)[:32]}.safetensors"
     with suppress(DataError):  # there are none, or the file is damaged
         return load_tensors(file)
     made = make()
     make_folder(folder)
     save_tensors(file, made)
     return made
-
-
-@lru_cache(maxsize=8)
-def _code(base: Any) -> str:
-    """Returns the checksum of a model without layers, whose code a process loads once."""
-    return code_checksum(base)
 
 
 def _checksum(segments: SegmentModel, *rest: Any) -> str:
@@ -103,7 +100,6 @@ def _checksum(segments: SegmentModel, *rest: Any) -> str:
         VERSION,
         versions(),
         source_text(segments.model),
-        _code(unwrapped(segments.model)[0]),
         segments.channel_names,
         type(simulator).__qualname__,
         simulator.recorded_settings(),

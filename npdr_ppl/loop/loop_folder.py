@@ -28,7 +28,7 @@ from npdr_ppl.errors import DataError
 from npdr_ppl.language.model import Model
 from npdr_ppl.loop.control_task import ControlTask
 from npdr_ppl.model_code import code_checksum
-from npdr_ppl.model_identity import source_text, versions
+from npdr_ppl.model_identity import model_name, source_text, versions
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.run_files import (
     holds_this_run,
@@ -82,7 +82,7 @@ class LoopFolder:
         description = plain(
             {
                 "format": FORMAT,
-                "model": source_text(model),
+                "name": model_name(model),
                 "code": code_checksum(model),
                 "target": repr(target),
                 "task": task.name,
@@ -96,7 +96,8 @@ class LoopFolder:
         iterations = description["options"].pop("iterations")
         file = self.path / "loop.json"
         if not holds_this_run(file, description):
-            write_json(file, description | {"iterations": iterations, "versions": versions()})
+            written = {"iterations": iterations, "versions": versions()}
+            write_json(file, description | written | {"model": source_text(model)})
 
     @property
     def rollouts(self) -> Path:

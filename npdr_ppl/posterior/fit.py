@@ -18,6 +18,7 @@ from npdr_ppl.inference.base import Backend
 from npdr_ppl.inference.registry import backend as backend_by_name
 from npdr_ppl.language.handlers import num_finer_steps
 from npdr_ppl.language.model import Model
+from npdr_ppl.model_code import code_checksum
 from npdr_ppl.model_identity import engine_settings
 from npdr_ppl.posterior.diagnostics import Decision, diagnose
 from npdr_ppl.posterior.infer import infer
@@ -79,7 +80,7 @@ def fit(
     was_there = out is not None and out.exists()
     with reporter(progress) as report, claimed(out):
         try:
-            with collect_faults() as before, keep_fits(fits):
+            with collect_faults() as before, keep_fits(fits, code_checksum(model)):
                 prepared = prepare(
                     model,
                     train,

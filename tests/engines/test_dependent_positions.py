@@ -1,10 +1,12 @@
 """Positions that depend on each other, as the heading of a base on its two wheels."""
 
 import numpy as np
+import pytest
 import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.engines.ode.simulator import ODESimulator
+from npdr_ppl.engines.ode.stepping import forces_of
 from npdr_ppl.models.effects import LoadDependentFriction
 
 
@@ -53,3 +55,21 @@ def test_friction_that_depends_on_load_finds_the_least_forces_of_the_actions():
     assert bool(found.isfinite().all())
     left, right = found[0, 0, -1, 3].item(), found[0, 0, -1, 4].item()
     assert 0.0 < left < right
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_forces_are_the_least_where_positions_depend_on_each_other(size):
+    generator = torch.Generator().manual_seed(size)
+    parts = torch.randn(50, size, size - 1, generator=generator).double()
+    inertia = parts @ parts.mT
+    inertia[:10] += torch.eye(size).double()
+    inertia[10] = torch.nan
+    forces = torch.randn(50, size, generator=generator).double()
+    caused = (inertia @ forces[..., None])[..., 0]
+    rows = tuple(tuple(row.unbind(-1)) for row in inertia.unbind(-2))
+    found = torch.stack(forces_of(caused.unbind(-1), rows), dim=-1)
+    assert torch.allclose(found[:10], forces[:10])
+    assert bool(found[10].isnan().all())
+    for matrix, accelerations, force in zip(inertia[11:], caused[11:], found[11:], strict=True):
+        least = np.linalg.lstsq(matrix.numpy(), accelerations.numpy(), rcond=1e-9)[0]
+        assert np.allclose(force, least, rtol=1e-5, atol=1e-6)
