@@ -31,6 +31,7 @@ class ModelCode:
 
     Attributes:
         file: The Python file that defines the model; ``None`` if there is none.
+        name: The model's name there; empty if it has none, such as a function inside another one.
         text: The part of it that the model needs.
         neighbours: Code of the Python files in the same folder that it imports, directly or
             through others, by path.
@@ -40,6 +41,7 @@ class ModelCode:
     """
 
     file: Path | None = None
+    name: str = ""
     text: str = ""
     neighbours: Mapping[Path, str] = field(default_factory=dict)
     named: tuple[Path, ...] = ()
@@ -53,8 +55,8 @@ def code_of(model: Any) -> ModelCode:
         model: A Pyro model, possibly inside layers and handlers.
     """
     try:
-        file, names = _place(unwrapped(model)[0])
-        text = _needed(file, names)
+        file, name, outermost = _place(unwrapped(model)[0])
+        text = _needed(file, name or outermost)
     except (OSError, TypeError):
         return ModelCode()
     neighbours = _neighbours(text, file.parent)
@@ -64,6 +66,7 @@ def code_of(model: Any) -> ModelCode:
     is_beside = any(path == file.parent / word for word, path in relative.items())
     return ModelCode(
         file=file,
+        name=name,
         text=text,
         neighbours=neighbours,
         named=tuple(sorted(set(named.values()))),
@@ -88,8 +91,10 @@ def code_checksum(model: Any) -> str:
     return digest.hexdigest()
 
 
-def _place(model: Any) -> tuple[Path, set[str]]:
-    """Returns the file that defines a model, and the model's top-level names in it.
+def _place(model: Any) -> tuple[Path, str, str]:
+    """Returns the file that defines a model, the model's name there, and the outer definition's.
+
+    The model's name is empty if the file has none for it, as for a function inside another one.
 
     Raises:
         OSError: There is no such file.
@@ -102,20 +107,20 @@ def _place(model: Any) -> tuple[Path, set[str]]:
         definition = type(definition)
     # What a factory made, or an instance of a class, has its arguments where it has its name.
     for module in (sys.modules.get(definition.__module__), *loaded_files()):
-        names = {name for name, value in list(vars(module or object).items()) if value is model}
+        names = [name for name, value in list(vars(module or object).items()) if value is model]
         file = getattr(module, "__file__", None)
         if names and file:
-            return Path(file), names
-    # Of a function inside another one, the outer one is a part of the file.
-    name = definition.__qualname__.partition(".")[0]
-    return Path(inspect.getsourcefile(definition) or ""), {name}
+            own = getattr(model, "__name__", "")
+            return Path(file), own if own in names else names[0], ""
+    outermost = definition.__qualname__.partition(".")[0]
+    return Path(inspect.getsourcefile(definition) or ""), "", outermost
 
 
-def _needed(file: Path, names: set[str]) -> str:
-    """Returns the part of a file that names need; all of it if it does not define them."""
+def _needed(file: Path, name: str) -> str:
+    """Returns the part of a file that a name needs; all of it if it does not define it."""
     text = _read(file)
     try:
-        needed = excerpt(text, names)
+        needed = excerpt(text, {name})
     except (SyntaxError, ValueError):
         return text
     return _plain("\n".join([*needed.imports, needed.body]) if needed.body else text)
@@ -125,7 +130,7 @@ def _code_of_effect(effect: Effect) -> str:
     """Returns an effect's arguments, and the code of its class if a user's file defines it."""
     own = type(effect)
     file = None if is_importable(own.__module__) else class_file(own)
-    return repr(effect) if file is None else f"{effect!r}\n{_needed(file, {class_name(own)})}"
+    return repr(effect) if file is None else f"{effect!r}\n{_needed(file, class_name(own))}"
 
 
 def _neighbours(text: str, folder: Path) -> dict[Path, str]:

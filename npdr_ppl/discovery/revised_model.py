@@ -124,18 +124,18 @@ def _distribution(prior: Distribution) -> str | None:
 
 def _base(model: Model) -> tuple[str, str, Path | None]:
     """Returns the source that defines a model, the model's name, and the file that is copied."""
-    module = inspect.getmodule(model)
-    name = getattr(model, "__name__", type(model).__name__)
-    if module is not None and is_importable(module.__name__):
-        doc = f'"""{name} with the effects that it was missing."""'
+    module, code = inspect.getmodule(model), code_of(model)
+    name = code.name or getattr(model, "__name__", type(model).__name__)
+    doc = f'"""{name} with the effects that it was missing."""'
+    is_there = module is not None and code.file in (None, Path(module.__file__ or ""))
+    if module is not None and is_there and is_importable(module.__name__):
         return f"{doc}\n\nfrom {module.__name__} import {name}", name, None
-    code = code_of(model)
     if code.file is None:
         return f"# The source of {name} was not found: import it here.", name, None
     if code.is_alone:
         return code.file.read_text(encoding="utf-8"), name, code.file
     lines = [
-        f'"""{name} with the effects that it was missing."""',
+        doc,
         "",
         "from pathlib import Path",
         "",

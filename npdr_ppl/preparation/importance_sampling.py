@@ -75,17 +75,20 @@ def sample_posterior(
     most_iterations: int | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> WeightedDraws:
-    """Draws from the posterior of a recording by adaptive importance sampling.
+    """Draws from the posterior of a recording.
 
-    The first proposal is Laplace's approximation at the closest fit, in coordinates in which
-    ridges are straight; see :mod:`npdr_ppl.preparation.ridges`.
+    Draws with polynomials in place of the simulator are tried first; see
+    :mod:`npdr_ppl.preparation.surrogate_sampling`. Where these do not suffice, they come from
+    adaptive importance sampling. Its first proposal is Laplace's approximation at the closest fit,
+    in coordinates in which ridges are straight; see :mod:`npdr_ppl.preparation.ridges`.
 
     Args:
         likelihood: The recording's likelihood.
         proposals: Further first proposals, densities over reference coordinates; for example
             posteriors that a backend has learnt.
         seed: Seed of the draws.
-        is_rough: Whether ridges are taken as straight, and draws do not move on to their ends.
+        is_rough: Whether polynomials are not tried, ridges are taken as straight, and draws do not
+            move on to their ends.
         most_iterations: Greatest number of proposals; that of the settings by default.
         report: Called with a short status after each proposal.
     """
@@ -127,10 +130,7 @@ def sample_posterior(
         size = size if math.isfinite(k_hat) else 0.0
         wanted = settings.enough_effective
         report(f"{len(z)} draws, {min(size, wanted):.0f} of {wanted:.0f} effective ones")
-        is_enough = result.has_enough
-        if is_enough and (not space.num_weak or (iteration == 0 and not given)):
-            break
-        if is_enough:
+        if result.has_enough:
             break
         if iteration + 1 >= settings.iterations_to_adapt and size < z.shape[1]:
             break

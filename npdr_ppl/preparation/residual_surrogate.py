@@ -61,11 +61,13 @@ class ResidualSurrogate:
             len(w) // 2,
         )
         chosen = excess.argsort()[:num]
-        # The polynomials depend on the residuals by their products only, so that residuals in
-        # fewer dimensions with the same products have the same polynomials.
-        sizes, vectors = torch.linalg.eigh(gram[chosen][:, chosen])
-        residuals = vectors * sizes.clamp_min(0.0).sqrt()
         weights = (1.0 + excess[chosen] / d).rsqrt()
+        # The polynomials depend on the residuals by their products only, so that residuals in
+        # fewer dimensions with the same products have the same polynomials. Weights first: large
+        # residuals would drown the others.
+        products = weights[:, None] * gram[chosen][:, chosen] * weights
+        sizes, vectors = torch.linalg.eigh(products)
+        residuals = vectors * sizes.clamp_min(0.0).sqrt() / weights[:, None]
         points = (w[chosen] - middle) / scale
         found = fit_polynomial(
             points,

@@ -358,27 +358,29 @@ class ResidualSurrogateSettings:
     Attributes:
         fewest_first: Least number of simulations before the first fit.
         most_first: Greatest number; a recording of more parameters is sampled without polynomials.
-        most_bytes: Most memory for the residuals of all simulations.
+        most_bytes: Most memory for the residuals to which polynomials are fitted.
         draw_factor: Number of draws for each first simulation; those outside the prior's support
             are dropped.
-        points_per_term: Number of points for each term of a quadratic, to which polynomials are
-            fitted at least; of more, only the more likely half is used, or those that are near.
-        near: Difference of the log density from the greatest up to which points are near, in units
-            of the number of parameters. Draws of a normal density have half of it on average.
+        points_per_term: Polynomials are fitted to the most likely points: at least to this many
+            for each term of a quadratic, to half of all points, and to all that are near.
+        near: Difference of the log density from the greatest up to which points are near, for each
+            parameter. For draws of a normal density, it is a half on average.
         most_degree: Greatest degree of the polynomials.
         penalties: Penalties of squared coefficients, per point, of which the one with the smallest
             leave-one-out error is taken.
         least_penalty: Penalty in the information about the coefficients, which keeps it regular.
-        inside_share: Share of the points of a fit with a smaller leverage than the farther ones.
-            While polynomials are far off, draws are kept from going beyond.
+        inside_share: Quantile of the leverages of a fit's points. While polynomials are far off,
+            draws with a greater leverage are not allowed.
         widest_reach: Greatest leverage of draws under polynomials that are not far off, in units
-            of that of the farther points. With ten, draws may be 1.8 times as far from the middle.
+            of this quantile. With ten, draws under quadratics may be 1.8 times as far from the
+            middle.
         tested: Number of draws under the polynomials that are simulated to test them.
         most_fits: Greatest number of fits.
         least_share: Effective share of the tested draws from which the polynomials can be used.
         enough_share: Effective share from which further fits would not pay.
         margin: Factor of the number of draws beyond what the tested ones predict.
-        unlikely_share: Share of the draws that are less likely than a draw of a mode.
+        unlikely_share: A draw of another density is likely if this share of the own draws is less
+            likely than it.
         even_share: Effective share of the points at which chains begin.
         num_walkers: Number of chains.
         sweeps: Number of moves of each.
@@ -413,8 +415,8 @@ class ResidualSurrogateSettings:
         check_range(self, 1, 10, "most_degree")
         check_range(self, 0.0, 1.0, "least_share", "enough_share", "even_share")
         check_range(self, 0.0, 1.0, "unlikely_share", "inside_share")
-        check_range(self, 1, math.inf, "tested", "most_fits", "sweeps")
-        check_range(self, 4, math.inf, "num_walkers")
+        check_range(self, 1, math.inf, "tested", "most_fits")
+        check_range(self, 4, math.inf, "num_walkers", "sweeps")
 
 
 @dataclass(frozen=True)

@@ -63,12 +63,12 @@ def surrogate_draws(
     simulated.add(w[space.to_reference(w)[1]][:num_first])
     if not len(simulated.w):
         return None
-    others = torch.cat([simulated.w[:0], *map(space.from_reference, drawn)])
-    values_of_others, _ = simulated.simulate(others)
+    others = torch.cat([torch.empty(0, d).double(), *map(space.from_reference, drawn)])
+    values_of_others = simulated.values(others)
     reach = settings.widest_reach
     for attempt in range(settings.most_fits):
         fitted = ResidualSurrogate.of(
-            simulated.w, simulated.gram(), simulated.log_density, mean, scale
+            simulated.w, simulated.gram, simulated.log_density, mean, scale
         )
         if fitted is None:
             return None
@@ -89,11 +89,12 @@ def surrogate_draws(
             continue
         number = math.ceil(IMPORTANCE_SAMPLING.enough_effective / share * settings.margin)
         further = made[settings.tested : max(number, settings.tested)]
-        w, values = torch.cat((w, further)), torch.cat((values, simulated.add(further)))
+        w, values = torch.cat((w, further)), torch.cat((values, simulated.values(further)))
         smoothed, k_hat = smoothed_weights(values - density(w))
         found = WeightedDraws.of(w, space, smoothed, k_hat, attempt + 1)
         # Other draws that are as likely, but do not occur under the polynomials.
-        is_likely = values_of_others > values.quantile(settings.unlikely_share)
+        least = values[values.isfinite()].quantile(settings.unlikely_share)
+        is_likely = values_of_others > least
         if bool((is_likely & (density(others) < density(w).min())).any()):
             return None
         if found.is_reliable:
@@ -111,20 +112,44 @@ class _Simulated:
     Attributes:
         w: The points, ``(n, d)``.
         log_density: Their log density over w up to a constant, ``(n,)``.
+        gram: Products of their residuals, ``(n, n)``.
     """
 
     def __init__(self, likelihood: SegmentLikelihood, space: RidgeCoordinates) -> None:
         self._likelihood, self._space = likelihood, space
         self._residuals: list[Tensor] = []
-        self._gram = torch.empty(0, 0, dtype=torch.float64)
         self.w = torch.empty(0, len(space.centre), dtype=torch.float64)
         self.log_density = torch.empty(0, dtype=torch.float64)
+        self.gram = torch.empty(0, 0, dtype=torch.float64)
 
-    def simulate(self, w: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the log density of points ``(m, d)``, and residuals where it is finite.
+    def values(self, w: Tensor) -> Tensor:
+        """Returns the log density of points ``(m, d)`` without keeping them.
 
         It is minus infinity outside the prior's support and where a simulation fails.
         """
+        parts = w.split(RESIDUAL_SURROGATE.tested)
+        return torch.cat([self._simulated(part)[0] for part in parts])
+
+    def add(self, w: Tensor) -> Tensor:
+        """Simulates points ``(m, d)`` and keeps them; see :meth:`values`.
+
+        Points where the log density is not finite are not kept.
+        """
+        found = []
+        for part in w.split(RESIDUAL_SURROGATE.tested):
+            values, residuals = self._simulated(part)
+            found.append(values)
+            is_known = values.isfinite()
+            if bool(is_known.any()):
+                # Single precision suffices for polynomials, and halves the memory.
+                self._residuals.append(residuals.float())
+                self.gram = self._extended_gram(residuals)
+                self.w = torch.cat((self.w, part[is_known]))
+                self.log_density = torch.cat((self.log_density, values[is_known]))
+        return torch.cat(found)
+
+    def _simulated(self, w: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the log density of points, and residuals where it is finite."""
         values = torch.full((len(w),), -torch.inf, dtype=torch.float64)
         inside = torch.zeros(len(w), dtype=torch.bool)
         if len(w):
@@ -132,37 +157,18 @@ class _Simulated:
         if not bool(inside.any()):
             return values, torch.empty(0, dtype=torch.float64)
         residuals = self._likelihood.whitened(z[inside])
-        prior = self._space.log_prior(z[inside])
-        found = (prior - 0.5 * residuals.square().sum(-1)).nan_to_num(-torch.inf, -torch.inf)
+        found = self._space.log_prior(z[inside]) - 0.5 * residuals.square().sum(-1)
+        # Residuals must not be too large for single precision.
+        found = torch.where(found > torch.finfo(torch.float32).min, found, -torch.inf)
         values[inside] = found
         return values, residuals[found.isfinite()]
 
-    def add(self, w: Tensor) -> Tensor:
-        """Simulates points ``(m, d)`` and keeps them; returns their log density.
-
-        Points where it is not finite are not kept.
-        """
-        values, residuals = self.simulate(w)
-        is_known = values.isfinite()
-        if bool(is_known.any()):
-            # Single precision suffices for polynomials, and halves the memory.
-            self._residuals.append(residuals.float())
-            self._gram = self._extended_gram()
-            self.w = torch.cat((self.w, w[is_known]))
-            self.log_density = torch.cat((self.log_density, values[is_known]))
-        return values
-
-    def gram(self) -> Tensor:
-        """Returns the products of the points' residuals, ``(n, n)``."""
-        return self._gram
-
-    def _extended_gram(self) -> Tensor:
-        """Returns the products with the newest points among them."""
-        new = self._residuals[-1].double()
+    def _extended_gram(self, new: Tensor) -> Tensor:
+        """Returns the products with new residuals, the last ones, among them."""
         across = torch.cat([part.double() @ new.mT for part in self._residuals])
-        before = len(self._gram)
+        before = len(self.gram)
         result = torch.zeros(len(across), len(across), dtype=torch.float64)
-        result[:before, :before] = self._gram
+        result[:before, :before] = self.gram
         result[:, before:] = across
         result[before:] = across.mT
         return result

@@ -21,8 +21,8 @@ class WeightedDraws:
         space: These coordinates.
         log_weights: Logarithms of their weights, whose sum is one, ``(n,)``.
         k_hat: Shape of the tail of the weights; reliable up to ``IMPORTANCE_SAMPLING.reliable_k``.
-        effective: Effective sample size of the importance sampling.
-        iterations: Iterations that were needed.
+        effective: Effective sample size of the weights.
+        iterations: Number of proposals, or of fits of polynomials, that were needed.
     """
 
     z: Tensor

@@ -75,8 +75,7 @@ class Draws:
 def posterior_draws(hypothesis: Hypothesis, *, seed: int, is_rough: bool = False) -> Draws:
     """Returns draws of the posterior, given the recording.
 
-    They come from adaptive importance sampling; see
-    :mod:`npdr_ppl.preparation.importance_sampling`.
+    See :mod:`npdr_ppl.preparation.importance_sampling`.
 
     Args:
         hypothesis: The fitted model.

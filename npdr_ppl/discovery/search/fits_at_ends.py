@@ -44,8 +44,8 @@ def sites_at_end(hypothesis: Hypothesis, *, near: float = PRIOR_ENDS.near_coordi
 def with_wider_strengths(hypothesis: Hypothesis) -> tuple[tuple[Effect, ...], frozenset[str]]:
     """Returns the effects with wider priors of strengths that have the fit at an end.
 
-    How strong a missing effect is, its prior cannot know. If the prior ends before, another effect
-    explains the rest. Shapes keep their priors: an implausible one shows that a law is wrong.
+    A prior cannot know how strong a missing effect is. If it ends too early, another effect is
+    added for the rest. Shapes keep their priors: an implausible one shows that a law is wrong.
 
     Args:
         hypothesis: The closest fit of a model with effects.
@@ -68,7 +68,7 @@ def with_wider_strengths(hypothesis: Hypothesis) -> tuple[tuple[Effect, ...], fr
 def is_movable(prior: Any, *, is_lower: bool) -> bool:
     """Returns whether a wider prior has more probability beyond an end.
 
-    It has not below a prior that begins at zero, such as that of a friction.
+    It has none below a prior that begins at zero, such as that of a friction.
     """
     wider, share = widened(prior), PRIOR_ENDS.outside_probability
     if wider is None:

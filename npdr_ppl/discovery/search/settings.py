@@ -131,9 +131,11 @@ class PriorEndSettings:
             value as too narrow.
         outside_probability: A value is outside its prior if the prior probability beyond it is at
             most this.
-        outside_coordinate: The same of an effect's strength. A strong effect often is in the
+        outside_coordinate: An effect's strength is near an end from this absolute reference
+            coordinate on. It is greater than that of parameters: a strong effect often is in the
             outermost 5 % of its prior, and each fit with wider priors costs time.
-        most_widenings: Greatest number of times that priors are widened, each time threefold.
+        most_widenings: Greatest number of times that priors are widened, each time threefold, or
+            twofold if they begin at zero and have bounds.
     """
 
     near_coordinate: float = 1.64

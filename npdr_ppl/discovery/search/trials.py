@@ -223,7 +223,7 @@ class Trials:
         """Yields the hypothesis of each fit, ``None`` where the model cannot be simulated.
 
         The priors of effects' strengths are widened where the fit is at their end, if it then fits
-        better.
+        better. Effects that the bound model already has keep their priors.
         """
         possible = [fit for fit in asked if fit is not None]
         found = side_by_side(_fitted, possible, num_processes(simulator))
