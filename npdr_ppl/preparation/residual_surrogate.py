@@ -38,14 +38,13 @@ class ResidualSurrogate:
 
     @classmethod
     def of(
-        cls, w: Tensor, gram: Tensor, log_density: Tensor, middle: Tensor, scale: Tensor
+        cls, w: Tensor, gram: Tensor, middle: Tensor, scale: Tensor
     ) -> "ResidualSurrogate | None":
-        """Fits polynomials to the points with the greatest log density.
+        """Fits polynomials to the points with the smallest residuals.
 
         Args:
             w: Points, ``(n, d)``.
             gram: Products of their whitened residuals, q_i · q_j, ``(n, n)``.
-            log_density: Their log density up to a constant, ``(n,)``.
             middle: Origin of the polynomials, ``(d,)``.
             scale: Scale of their variables, e.g. standard deviations, ``(d,)``.
 
@@ -53,7 +52,8 @@ class ResidualSurrogate:
             ``None`` if there are too few points.
         """
         settings, d = RESIDUAL_SURROGATE, w.shape[1]
-        excess = log_density.max() - log_density
+        # The prior does not count: where only the prior tells, points may be far apart.
+        excess = 0.5 * (gram.diagonal() - gram.diagonal().min())
         # The excess of draws of a normal density is half a chi-square variable, d/2 on average.
         num = max(
             round(settings.points_per_term * num_terms(d, 2)),
@@ -85,8 +85,11 @@ class ResidualSurrogate:
         ridge = settings.least_penalty * len(points) * torch.eye(terms.shape[1]).double()
         inverse = torch.linalg.inv(terms.mT @ terms + ridge)
         squares = found.coefficients @ found.coefficients.mT
-        leverages = _products(terms / weights[:, None], inverse)
-        farthest = float(leverages.quantile(settings.inside_share))
+        leverages = _products(terms, inverse)
+        # As if each point were left out: of a fit with few points, it has a far smaller leverage
+        # than a point that is not in the fit.
+        left_out = leverages / weights.square() / (1.0 - leverages).clamp_min(1e-3)
+        farthest = float(left_out.quantile(settings.inside_share))
         return cls(middle, scale, found.degree, squares, inverse, farthest)
 
     def __call__(self, w: Tensor, reach: float = 1.0) -> Tensor:
@@ -98,8 +101,15 @@ class ResidualSurrogate:
                 polynomials are not trusted. The log likelihood is minus infinity there.
         """
         terms = monomials((w - self.middle) / self.scale, self.degree)
-        is_known = _products(terms, self.inverse) <= reach * self.farthest
+        is_known = self._leverage(terms) <= reach
         return torch.where(is_known, -0.5 * _products(terms, self.squares), -torch.inf)
+
+    def leverage(self, w: Tensor) -> Tensor:
+        """Returns how far points ``(n, d)`` are from those of the fit, ``(n,)``; see above."""
+        return self._leverage(monomials((w - self.middle) / self.scale, self.degree))
+
+    def _leverage(self, terms: Tensor) -> Tensor:
+        return _products(terms, self.inverse) / self.farthest
 
 
 def _products(terms: Tensor, matrix: Tensor) -> Tensor:

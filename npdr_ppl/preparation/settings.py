@@ -369,11 +369,13 @@ class ResidualSurrogateSettings:
         penalties: Penalties of squared coefficients, per point, of which the one with the smallest
             leave-one-out error is taken.
         least_penalty: Penalty in the information about the coefficients, which keeps it regular.
-        inside_share: Quantile of the leverages of a fit's points. While polynomials are far off,
-            draws with a greater leverage are not allowed.
-        widest_reach: Greatest leverage of draws under polynomials that are not far off, in units
-            of this quantile. With ten, draws under quadratics may be 1.8 times as far from the
-            middle.
+        inside_share: Quantile of the leverages of a fit's points that is the unit of reaches.
+        first_reach: Greatest leverage of the first draws. With ten, draws under quadratics may be
+            1.8 times as far from the middle as most points.
+        more_reach: Factor of the reach after polynomials that are right, but keep draws from going
+            farther; its inverse after wrong ones.
+        outermost: Quantile of the draws' leverages that has to be within half of the reach;
+            otherwise the posterior may be wider than the draws.
         tested: Number of draws under the polynomials that are simulated to test them.
         most_fits: Greatest number of fits.
         least_share: Effective share of the tested draws from which the polynomials can be used.
@@ -383,7 +385,11 @@ class ResidualSurrogateSettings:
             likely than it.
         even_share: Effective share of the points at which chains begin.
         num_walkers: Number of chains.
-        sweeps: Number of moves of each.
+        fewest_sweeps: Number of moves of each at first; it is doubled until chains are mixed.
+        most_sweeps: Greatest number of moves of each.
+        most_correlated: Correlation of the chains' coordinates after half of the moves with those
+            at the end, below which they are mixed. What is left of where they began is about its
+            square.
     """
 
     fewest_first: int = 128
@@ -396,7 +402,9 @@ class ResidualSurrogateSettings:
     penalties: tuple[float, ...] = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
     least_penalty: float = 1e-6
     inside_share: float = 0.9
-    widest_reach: float = 10.0
+    first_reach: float = 10.0
+    more_reach: float = 10.0
+    outermost: float = 0.99
     tested: int = 128
     most_fits: int = 8
     least_share: float = 0.2
@@ -405,18 +413,21 @@ class ResidualSurrogateSettings:
     unlikely_share: float = 0.1
     even_share: float = 0.1
     num_walkers: int = 256
-    sweeps: int = 200
+    fewest_sweeps: int = 200
+    most_sweeps: int = 3200
+    most_correlated: float = 0.25
 
     def __post_init__(self) -> None:
         """Checks the values; raises ``ValueError``."""
         check_range(self, 1, math.inf, "fewest_first", "most_first", "most_bytes", "draw_factor")
-        check_range(self, 1.0, 100.0, "points_per_term", "margin", "widest_reach")
+        check_range(self, 1.0, 100.0, "points_per_term", "margin", "first_reach", "more_reach")
         check_range(self, 0.0, math.inf, "near", "penalties", "least_penalty")
         check_range(self, 1, 10, "most_degree")
         check_range(self, 0.0, 1.0, "least_share", "enough_share", "even_share")
-        check_range(self, 0.0, 1.0, "unlikely_share", "inside_share")
+        check_range(self, 0.0, 1.0, "unlikely_share", "inside_share", "outermost")
+        check_range(self, 0.0, 1.0, "most_correlated")
         check_range(self, 1, math.inf, "tested", "most_fits")
-        check_range(self, 4, math.inf, "num_walkers", "sweeps")
+        check_range(self, 4, math.inf, "num_walkers", "fewest_sweeps", "most_sweeps")
 
 
 @dataclass(frozen=True)

@@ -65,27 +65,29 @@ def surrogate_draws(
         return None
     others = torch.cat([torch.empty(0, d).double(), *map(space.from_reference, drawn)])
     values_of_others = simulated.values(others)
-    reach = settings.widest_reach
+    reach = settings.first_reach
     for attempt in range(settings.most_fits):
-        fitted = ResidualSurrogate.of(
-            simulated.w, simulated.gram, simulated.log_density, mean, scale
-        )
+        fitted = ResidualSurrogate.of(simulated.w, simulated.gram, mean, scale)
         if fitted is None:
             return None
         density = _posterior(space, fitted, reach)
         own_seed = derived_seed(seed, "surrogate", attempt)
-        made = _made(simulated, density, own_seed)
+        made, is_mixed = _made(simulated, density, own_seed)
         made = made[torch.randperm(len(made), generator=torch.Generator().manual_seed(own_seed))]
         w = made[: settings.tested]
         values = simulated.add(w)
         smoothed, k_hat = smoothed_weights(values - density(w))
         share = effective_size(smoothed) / len(w) if math.isfinite(k_hat) else 0.0
         report(f"{len(simulated.w)} draws, polynomials {share:.0%} effective")
+        # Weights do not show what draws are kept from: the outermost ones do.
+        is_cut = float(fitted.leverage(made).quantile(settings.outermost)) > 0.5 * reach
+        if share < settings.least_share:
+            reach = max(1.0, reach / settings.more_reach)
+        elif is_cut:
+            reach = reach * settings.more_reach
+        is_enough = share >= settings.enough_share or attempt + 1 == settings.most_fits
         is_close = k_hat <= IMPORTANCE_SAMPLING.reliable_k and share >= settings.least_share
-        is_last = attempt + 1 == settings.most_fits
-        is_wide = reach == settings.widest_reach
-        reach = settings.widest_reach if is_close else 1.0
-        if not (is_close and is_wide) or (share < settings.enough_share and not is_last):
+        if is_cut or not (is_mixed and is_close and is_enough):
             continue
         number = math.ceil(IMPORTANCE_SAMPLING.enough_effective / share * settings.margin)
         further = made[settings.tested : max(number, settings.tested)]
@@ -193,8 +195,12 @@ def _posterior(space: RidgeCoordinates, fitted: ResidualSurrogate, reach: float)
     return log_density
 
 
-def _made(simulated: _Simulated, density: LogDensity, seed: int) -> Tensor:
-    """Returns draws of a density by Markov chains, which begin at simulated points."""
+def _made(simulated: _Simulated, density: LogDensity, seed: int) -> tuple[Tensor, bool]:
+    """Returns draws of a density by Markov chains, which begin at simulated points.
+
+    The number of sweeps is doubled until the chains have forgotten where they were after half of
+    them. Also returned is whether they have before the greatest number.
+    """
     settings = RESIDUAL_SURROGATE
     # The points of the fit are among those where the polynomials are known.
     is_known = density(simulated.w).isfinite()
@@ -202,11 +208,25 @@ def _made(simulated: _Simulated, density: LogDensity, seed: int) -> Tensor:
     # If few points have most of the weight, chains begin at more of them.
     exponent = longest_step(known, 1.0, settings.even_share)
     with seeded(seed, "first"):
-        first = w[systematic(exponent * known, settings.num_walkers)]
-    return ensemble_draws(
-        density,
-        first,
-        sweeps=settings.sweeps,
-        interval=settings.sweeps // 4,
-        generator=torch.Generator().manual_seed(seed),
-    )
+        w = w[systematic(exponent * known, settings.num_walkers)]
+    generator = torch.Generator().manual_seed(seed)
+
+    def moved(w: Tensor, sweeps: int) -> Tensor:
+        return ensemble_draws(density, w, sweeps=sweeps, interval=sweeps, generator=generator)
+
+    sweeps = settings.fewest_sweeps // 2
+    w = moved(w, sweeps)
+    while True:
+        between = moved(w, sweeps // 2)
+        last = moved(between, sweeps - sweeps // 2)
+        is_mixed = _correlation(w, last) < settings.most_correlated
+        if is_mixed or 4 * sweeps > settings.most_sweeps:
+            return torch.cat((between, last)), is_mixed
+        w, sweeps = last, 2 * sweeps
+
+
+def _correlation(w: Tensor, later: Tensor) -> float:
+    """Returns the greatest correlation of a coordinate of chains with that at a later time."""
+    first, second = (each - each.mean(0) for each in (w, later))
+    both = (first.square().sum(0) * second.square().sum(0)).sqrt()
+    return float(((first * second).sum(0) / both.clamp_min(1e-300)).max())

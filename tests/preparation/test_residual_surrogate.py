@@ -27,7 +27,7 @@ def fitted(number):
     w = 1.5 * torch.randn(number, 2, generator=generator, dtype=torch.float64)
     q = residuals(w)
     zero, one = torch.zeros(2).double(), torch.ones(2).double()
-    return ResidualSurrogate.of(w, q @ q.mT, -0.5 * q.square().sum(-1), zero, one)
+    return ResidualSurrogate.of(w, q @ q.mT, zero, one)
 
 
 def test_a_bent_ridge_is_known_from_few_points():
@@ -42,6 +42,19 @@ def test_polynomials_are_not_trusted_far_from_the_points_of_their_fit():
     surrogate = fitted(60)
     assert surrogate(near).isfinite() and surrogate(far) == -torch.inf
     assert surrogate(far, 1e12).isfinite()
+
+
+@pytest.mark.parametrize("size", [1e6, 1e18])
+def test_a_wild_residual_does_not_spoil_the_others(size):
+    generator = torch.Generator().manual_seed(0)
+    w = torch.randn(12, 2, generator=generator, dtype=torch.float64)
+    q = residuals(w)
+    q[3] *= size
+    zero, one = torch.zeros(2).double(), torch.ones(2).double()
+    wild = ResidualSurrogate.of(w, q @ q.mT, zero, one)
+    others = torch.arange(12) != 3
+    exact = -0.5 * residuals(w[others]).square().sum(-1)
+    assert wild(w[others], 1e12) == pytest.approx(exact, abs=1.0)
 
 
 def test_too_few_points_have_no_polynomials():
