@@ -65,7 +65,8 @@ def quick():
 
 @pytest.fixture
 def few_draws(monkeypatch):
-    """Gives the check of a posterior too few draws to agree with the simulator."""
+    """Gives the check of a posterior too few draws to agree with the simulator, and no others."""
+    monkeypatch.setattr(importance_sampling, "surrogate_draws", lambda *_, **__: None)
     few = replace(
         importance_sampling.IMPORTANCE_SAMPLING,
         most_iterations=1, draws_per_iteration=8, draws_of_given=8, num_walkers=4,
