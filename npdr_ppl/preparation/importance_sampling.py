@@ -92,12 +92,12 @@ def sample_posterior(
         most_iterations: Greatest number of proposals; that of the settings by default.
         report: Called with a short status after each proposal.
     """
-    if not is_rough:
-        led = surrogate_draws(likelihood, proposals, seed=seed, report=report)
-        if led is not None:
-            return led
     prior = likelihood.segments.prior
     space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=is_rough)
+    if not is_rough:
+        found = surrogate_draws(likelihood, space, proposals, seed=seed, report=report)
+        if found is not None:
+            return found
     settings = IMPORTANCE_SAMPLING
     own = [_Proposal(space.heavy_tailed(), settings.draws_per_iteration, space)]
     given = [_Proposal(density, settings.draws_of_given) for density in proposals]

@@ -118,30 +118,6 @@ class RidgeCoordinates:
             torch.diag(1.0 / (1.0 + information[:num_weak])),
         )
 
-    def bent_along(
-        self, w: Tensor, log_density: Tensor, density: LogDensity
-    ) -> "RidgeCoordinates":
-        """Returns straight coordinates with a polynomial through draws of the posterior.
-
-        Args:
-            w: The draws in these coordinates, ``(n, d)``.
-            log_density: Their log density up to a constant, ``(n,)``.
-            density: The log density over w, which may cost nothing.
-        """
-        can_be_weak = _num_weak(self.information)
-        is_weak = torch.zeros(len(self.centre), dtype=torch.bool)
-        if 0 < can_be_weak < len(is_weak):
-            is_weak[:can_be_weak] = self._most_curved(density, can_be_weak)
-        num_weak = int(is_weak.sum())
-        if num_weak in (0, len(is_weak)):
-            return self
-        order = torch.cat((is_weak.nonzero()[:, 0], (~is_weak).nonzero()[:, 0]))
-        found = self._straight(
-            self.space, self.centre, self.basis[:, order], self.information[order], num_weak
-        )._bent_through(w[:, order], log_density)
-        weak = w[:, order[:num_weak]]
-        return replace(found, weak_mean=weak.mean(0), weak_covariance=weak.mT.cov())
-
     def _most_curved(self, log_density: LogDensity, num: int) -> Tensor:
         """Returns along which of the first coordinates the posterior is most curved, ``(num,)``.
 

@@ -9,6 +9,8 @@ polynomials are fitted again: they become right where the posterior is.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -29,6 +31,7 @@ __all__ = ["surrogate_draws"]
 
 def surrogate_draws(
     likelihood: SegmentLikelihood,
+    space: RidgeCoordinates,
     given: Sequence[Density] = (),
     *,
     seed: int,
@@ -38,10 +41,11 @@ def surrogate_draws(
 
     Args:
         likelihood: The recording's likelihood.
+        space: Coordinates in which the posterior's ridges are straight.
         given: Densities over reference coordinates that may be posteriors; some of their draws
             are simulated, to see whether the polynomials leave out a mode.
         seed: Seed of the draws.
-        report: Called with a short status after each fit of the polynomials.
+        report: Called with a short status after each test of polynomials.
 
     Returns:
         ``None`` if polynomials do not represent the residuals, or leave out a mode, or if they
@@ -49,11 +53,10 @@ def surrogate_draws(
     """
     settings, d = RESIDUAL_SURROGATE, len(likelihood.fit.z)
     num_first = max(settings.fewest_first, math.ceil(1.25 * num_terms(d, 2)))
-    num_most = num_first + settings.most_fits * settings.tested
+    num_most = num_first + 2 * settings.most_fits * settings.tested
     num_bytes = 4 * num_most * likelihood.linearisation.residual.numel()
     if num_first > settings.most_first or num_bytes > settings.most_bytes:
         return None
-    space = RidgeCoordinates.of(likelihood, seed=seed, is_rough=True)
     mean, covariance = space.moments()
     scale = covariance.diagonal().sqrt()
     simulated = _Simulated(likelihood, space)
@@ -70,37 +73,24 @@ def surrogate_draws(
         fitted = ResidualSurrogate.of(simulated.w, simulated.gram, mean, scale)
         if fitted is None:
             return None
-        density = _posterior(space, fitted, reach)
+        is_last = attempt + 1 == settings.most_fits
+        least_share = settings.least_share if is_last else settings.enough_share
         own_seed = derived_seed(seed, "surrogate", attempt)
-        made, is_mixed = _made(simulated, density, own_seed)
-        made = made[torch.randperm(len(made), generator=torch.Generator().manual_seed(own_seed))]
-        w = made[: settings.tested]
-        values = simulated.add(w)
-        smoothed, k_hat = smoothed_weights(values - density(w))
-        share = effective_size(smoothed) / len(w) if math.isfinite(k_hat) else 0.0
-        report(f"{len(simulated.w)} draws, polynomials {share:.0%} effective")
-        # Weights do not show what draws are kept from: the outermost ones do.
-        is_cut = float(fitted.leverage(made).quantile(settings.outermost)) > 0.5 * reach
-        if share < settings.least_share:
+        tested = _tested(simulated, fitted, reach, least_share, own_seed)
+        report(f"{len(simulated.w)} draws, polynomials {tested.share:.0%} effective")
+        if tested.is_right:
+            found = tested.enough(simulated, attempt + 1)
+            # Other draws that are as likely, but do not occur under the polynomials.
+            least = tested.values[tested.values.isfinite()].quantile(settings.unlikely_share)
+            is_missed = tested.density(others) < tested.density(tested.w).min()
+            if bool(((values_of_others > least) & is_missed).any()):
+                return None
+            if found.is_reliable:
+                return found
+        elif tested.share < settings.least_share:
             reach = max(1.0, reach / settings.more_reach)
-        elif is_cut:
+        elif tested.is_cut:
             reach = reach * settings.more_reach
-        is_enough = share >= settings.enough_share or attempt + 1 == settings.most_fits
-        is_close = k_hat <= IMPORTANCE_SAMPLING.reliable_k and share >= settings.least_share
-        if is_cut or not (is_mixed and is_close and is_enough):
-            continue
-        number = math.ceil(IMPORTANCE_SAMPLING.enough_effective / share * settings.margin)
-        further = made[settings.tested : max(number, settings.tested)]
-        w, values = torch.cat((w, further)), torch.cat((values, simulated.values(further)))
-        smoothed, k_hat = smoothed_weights(values - density(w))
-        found = WeightedDraws.of(w, space, smoothed, k_hat, attempt + 1)
-        # Other draws that are as likely, but do not occur under the polynomials.
-        least = values[values.isfinite()].quantile(settings.unlikely_share)
-        is_likely = values_of_others > least
-        if bool((is_likely & (density(others) < density(w).min())).any()):
-            return None
-        if found.is_reliable:
-            return found.along(space.bent_along(w, values, density))
     return None
 
 
@@ -112,13 +102,15 @@ class _Simulated:
         space: Coordinates of the points.
 
     Attributes:
+        space: The same.
         w: The points, ``(n, d)``.
         log_density: Their log density over w up to a constant, ``(n,)``.
         gram: Products of their residuals, ``(n, n)``.
     """
 
     def __init__(self, likelihood: SegmentLikelihood, space: RidgeCoordinates) -> None:
-        self._likelihood, self._space = likelihood, space
+        self._likelihood = likelihood
+        self.space = space
         self._residuals: list[Tensor] = []
         self.w = torch.empty(0, len(space.centre), dtype=torch.float64)
         self.log_density = torch.empty(0, dtype=torch.float64)
@@ -155,11 +147,11 @@ class _Simulated:
         values = torch.full((len(w),), -torch.inf, dtype=torch.float64)
         inside = torch.zeros(len(w), dtype=torch.bool)
         if len(w):
-            z, inside = self._space.to_reference(w)
+            z, inside = self.space.to_reference(w)
         if not bool(inside.any()):
             return values, torch.empty(0, dtype=torch.float64)
         residuals = self._likelihood.whitened(z[inside])
-        found = self._space.log_prior(z[inside]) - 0.5 * residuals.square().sum(-1)
+        found = self.space.log_prior(z[inside]) - 0.5 * residuals.square().sum(-1)
         # Residuals must not be too large for single precision.
         found = torch.where(found > torch.finfo(torch.float32).min, found, -torch.inf)
         values[inside] = found
@@ -195,7 +187,91 @@ def _posterior(space: RidgeCoordinates, fitted: ResidualSurrogate, reach: float)
     return log_density
 
 
-def _made(simulated: _Simulated, density: LogDensity, seed: int) -> tuple[Tensor, bool]:
+@dataclass(frozen=True)
+class _Tested:
+    """Draws under polynomials, some of which were simulated.
+
+    Attributes:
+        made: The draws, ``(n, d)``.
+        density: The log density under which they were made.
+        values: The log density of the first ones by simulations, ``(m,)``.
+        is_mixed: Whether the chains have forgotten where they began.
+        is_cut: Whether the reach of the polynomials may have kept draws from going farther.
+        least_share: Least effective share.
+    """
+
+    made: Tensor
+    density: LogDensity
+    values: Tensor
+    is_mixed: bool
+    is_cut: bool
+    least_share: float
+
+    @property
+    def w(self) -> Tensor:
+        """The draws that were simulated, ``(m, d)``."""
+        return self.made[: len(self.values)]
+
+    @cached_property
+    def weights(self) -> tuple[Tensor, float]:
+        """Smoothed log weights of the simulated draws, and the shape of their tail."""
+        return smoothed_weights(self.values - self.density(self.w))
+
+    @property
+    def share(self) -> float:
+        """Effective share of the simulated draws."""
+        smoothed, k_hat = self.weights
+        return effective_size(smoothed) / len(self.w) if math.isfinite(k_hat) else 0.0
+
+    @property
+    def is_close(self) -> bool:
+        """Whether the polynomials are right where the draws are."""
+        is_even = self.weights[1] <= IMPORTANCE_SAMPLING.reliable_k
+        return is_even and self.share >= self.least_share and not self.is_cut
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the draws can be those of the posterior."""
+        return self.is_close and self.is_mixed
+
+    def enough(self, simulated: "_Simulated", iterations: int) -> WeightedDraws:
+        """Returns as many simulated draws as a posterior needs."""
+        settings = RESIDUAL_SURROGATE
+        number = math.ceil(IMPORTANCE_SAMPLING.enough_effective / self.share * settings.margin)
+        w = self.made[: max(number, len(self.values))]
+        further = simulated.values(w[len(self.values) :])
+        values = torch.cat((self.values, further))
+        smoothed, k_hat = smoothed_weights(values - self.density(w))
+        return WeightedDraws.of(w, simulated.space, smoothed, k_hat, iterations)
+
+
+def _tested(
+    simulated: _Simulated, fitted: ResidualSurrogate, reach: float, least_share: float, seed: int
+) -> _Tested:
+    """Returns draws under polynomials, some of which were simulated.
+
+    Chains are run until they are mixed only where the polynomials are right.
+    """
+    settings = RESIDUAL_SURROGATE
+    density = _posterior(simulated.space, fitted, reach)
+    tested = None
+    for most_sweeps in (settings.fewest_sweeps, settings.most_sweeps):
+        made, is_mixed = _made(simulated, density, most_sweeps, seed)
+        made = made[torch.randperm(len(made), generator=torch.Generator().manual_seed(seed))]
+        # Weights do not show what draws are kept from: the outermost ones do.
+        farthest = float(fitted.leverage(made).quantile(settings.outermost))
+        values = simulated.add(made[: settings.tested])
+        is_cut = farthest > 0.5 * reach
+        tested = _Tested(made, density, values, is_mixed, is_cut, least_share)
+        if is_mixed or not tested.is_close:
+            break
+    assert tested is not None
+    return tested
+
+
+def _made(
+    simulated: _Simulated, density: LogDensity, most_sweeps: int, seed: int
+) -> tuple[Tensor, bool]:
     """Returns draws of a density by Markov chains, which begin at simulated points.
 
     The number of sweeps is doubled until the chains have forgotten where they were after half of
@@ -220,7 +296,7 @@ def _made(simulated: _Simulated, density: LogDensity, seed: int) -> tuple[Tensor
         between = moved(w, sweeps // 2)
         last = moved(between, sweeps - sweeps // 2)
         is_mixed = _correlation(w, last) < settings.most_correlated
-        if is_mixed or 4 * sweeps > settings.most_sweeps:
+        if is_mixed or 4 * sweeps > most_sweeps:
             return torch.cat((between, last)), is_mixed
         w, sweeps = last, 2 * sweeps
 

@@ -1,6 +1,6 @@
 """Weighted draws of a posterior, and how much their weights can be trusted."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -40,10 +40,6 @@ class WeightedDraws:
         """Returns draws in coordinates in which ridges are straight; see the attributes."""
         z, size = space.to_reference(w)[0], effective_size(log_weights)
         return cls(z, w, space, log_weights, k_hat, size, iterations)
-
-    def along(self, space: RidgeCoordinates) -> "WeightedDraws":
-        """Returns the draws in other coordinates."""
-        return replace(self, w=space.from_reference(self.z), space=space)
 
     @property
     def weights(self) -> Tensor:

@@ -9,6 +9,7 @@ from npdr_ppl.inference.parts.mixtures.gaussian_mixture import GaussianMixture
 from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.residual_surrogate import ResidualSurrogate
+from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import RESIDUAL_SURROGATE
 from npdr_ppl.preparation.surrogate_sampling import surrogate_draws
@@ -66,6 +67,12 @@ def ridge():
     return prepare(product, swinging(rollouts=1, steps=200), DataOptions()).likelihood
 
 
+def drawn(likelihood, given=()):
+    """Draws with polynomials in coordinates in which the ridge is straight."""
+    space = RidgeCoordinates.of(likelihood, seed=0)
+    return surrogate_draws(likelihood, space, given, seed=0)
+
+
 def test_the_squares_of_whitened_residuals_are_the_likelihood(ridge):
     torch.manual_seed(0)
     z = ridge.fit.z + 0.1 * torch.randn(5, 3, dtype=torch.float64)
@@ -82,19 +89,19 @@ def test_few_simulations_suffice(ridge, monkeypatch):
         return whitened(self, z)
 
     monkeypatch.setattr(SegmentLikelihood, "whitened", counted)
-    found = surrogate_draws(ridge, seed=0)
+    found = drawn(ridge)
     assert found is not None and found.has_enough
     assert sum(asked) < 700
-    again = surrogate_draws(ridge, seed=0)
+    again = drawn(ridge)
     assert torch.equal(found.z, again.z)
 
 
 def test_draws_do_not_leave_out_a_mode(ridge):
-    found = surrogate_draws(ridge, seed=0)
+    found = drawn(ridge)
     mean, covariance = found.moments()
     one = torch.ones(1, dtype=torch.float64)
     same = GaussianMixture.from_moments(one, mean[None], covariance[None])
-    assert surrogate_draws(ridge, [same], seed=0) is not None
+    assert drawn(ridge, [same]) is not None
     # A copy of the closest fit, far from it along the most certain direction.
     way = torch.linalg.eigh(covariance).eigenvectors[:, 0]
     other = GaussianMixture.from_moments(
@@ -108,7 +115,7 @@ def test_draws_do_not_leave_out_a_mode(ridge):
             return super().whitened(torch.where(is_other[:, None], beside, z))
 
     fields = {f: getattr(ridge, f) for f in ridge.__dataclass_fields__}
-    found = surrogate_draws(TwoModes(**fields), [other], seed=0)
+    found = drawn(TwoModes(**fields), [other])
     is_other = None if found is None else (found.z - ridge.fit.z) @ way > 1.5
     assert is_other is None or (bool(is_other.any()) and not bool(is_other.all()))
 
@@ -116,4 +123,4 @@ def test_draws_do_not_leave_out_a_mode(ridge):
 def test_there_are_none_if_they_would_take_too_much_memory(ridge, monkeypatch):
     settings = replace(RESIDUAL_SURROGATE, most_bytes=1_000)
     monkeypatch.setattr("npdr_ppl.preparation.surrogate_sampling.RESIDUAL_SURROGATE", settings)
-    assert surrogate_draws(ridge, seed=0) is None
+    assert drawn(ridge) is None
