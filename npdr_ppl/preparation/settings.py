@@ -394,7 +394,7 @@ class ResidualSurrogateSettings:
 
     fewest_first: int = 128
     most_first: int = 2048
-    most_bytes: int = 256 * 2**20
+    most_bytes: int = 2**30
     draw_factor: int = 20
     points_per_term: float = 1.1
     near: float = 3.0

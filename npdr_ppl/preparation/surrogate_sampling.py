@@ -53,9 +53,8 @@ def surrogate_draws(
     """
     settings, d = RESIDUAL_SURROGATE, len(likelihood.fit.z)
     num_first = max(settings.fewest_first, math.ceil(1.25 * num_terms(d, 2)))
-    num_most = num_first + 2 * settings.most_fits * settings.tested
-    num_bytes = 4 * num_most * likelihood.linearisation.residual.numel()
-    if num_first > settings.most_first or num_bytes > settings.most_bytes:
+    num_most = settings.most_bytes // (4 * likelihood.linearisation.residual.numel())
+    if num_first > settings.most_first or num_first + settings.tested > num_most:
         return None
     mean, covariance = space.moments()
     scale = covariance.diagonal().sqrt()
@@ -71,7 +70,7 @@ def surrogate_draws(
     reach = settings.first_reach
     for attempt in range(settings.most_fits):
         fitted = ResidualSurrogate.of(simulated.w, simulated.gram, mean, scale)
-        if fitted is None:
+        if fitted is None or len(simulated.w) + settings.tested > num_most:
             return None
         is_last = attempt + 1 == settings.most_fits
         least_share = settings.least_share if is_last else settings.enough_share

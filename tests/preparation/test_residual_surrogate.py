@@ -13,7 +13,7 @@ from npdr_ppl.preparation.ridges import RidgeCoordinates
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
 from npdr_ppl.preparation.settings import RESIDUAL_SURROGATE
 from npdr_ppl.preparation.surrogate_sampling import surrogate_draws
-from tests.helpers.pendulum_recordings import product, swinging
+from tests.helpers.pendulum_recordings import links, product, swinging
 
 
 def residuals(w):
@@ -94,6 +94,16 @@ def test_few_simulations_suffice(ridge, monkeypatch):
     assert sum(asked) < 700
     again = drawn(ridge)
     assert torch.equal(found.z, again.z)
+
+
+@pytest.mark.slow
+def test_draws_are_as_wide_as_a_ridge_of_many_dimensions():
+    likelihood = prepare(links, swinging(), DataOptions()).likelihood
+    found = drawn(likelihood)
+    assert found is not None and found.is_reliable
+    # Eight normal masses of which only the sum is known.
+    spread = found.moments()[1].diagonal()[:8].sqrt()
+    assert spread.mean() == pytest.approx((7.0 / 8.0) ** 0.5, rel=0.1)
 
 
 def test_draws_do_not_leave_out_a_mode(ridge):
