@@ -33,6 +33,7 @@ from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import with_commands, with_followers, without_duplicates
 from npdr_ppl.rollouts.faults import without_faults
 from npdr_ppl.rollouts.notes import faults_among
+from npdr_ppl.rollouts.quaternion_signs import continuous
 from npdr_ppl.rollouts.simulator_checks import limited_commands
 from npdr_ppl.rollouts.wrapped_angles import unwrapped
 
@@ -164,7 +165,8 @@ def _without_visible_faults(rollouts: Rollouts, simulator: Simulator) -> Rollout
             f"None of the recording's columns {', '.join(rollouts.channel_names)} is a sensor of "
             f"the model, {names}; rename them."
         )
-    rollouts = without_faults(unwrapped(rollouts, measured), measured)
+    rollouts = continuous(unwrapped(rollouts, measured), measured)
+    rollouts = without_faults(rollouts, measured)
     try:
         rollouts.check(simulator.sensors, simulator.actions, allow_extra=True, strict=False)
     except DataError as error:
@@ -231,8 +233,8 @@ def _trusted_remedy(
     if best is not None and isinstance(best.apply, Shift):
         best, least = _refined(best.apply, ratio)
     if best is not None and least < REPAIR.remedy_factor:
-        if _is_early(best) and trials.ratio_with_lag() <= least:
-            # It is the device that answers late, which is for discovery to name.
+        if _is_early(best) and least >= REPAIR.remedy_factor * trials.ratio_with_lag():
+            # It may be the device that answers late, which is for discovery to name.
             return None
         without = trials.ratio_without(best)
     else:

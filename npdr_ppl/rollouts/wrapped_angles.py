@@ -17,7 +17,7 @@ from npdr_ppl.rollouts.container import Rollouts
 from npdr_ppl.rollouts.notes import Remark
 from npdr_ppl.rollouts.sampling import Sampling
 
-__all__ = ["unwrapped"]
+__all__ = ["joined", "nearest_of", "unwrapped"]
 
 TURNS = ((2.0 * math.pi, "rad"), (360.0, "degrees"))
 """A whole turn in each unit. A log may be in degrees without saying so."""
@@ -112,17 +112,38 @@ def _with_turns_added(
         return readings, sampling
     measured, place = sampling.values[rows, column], rows + sampling.lateness[rows, column]
     whole = np.unwrap(measured, period=turn)
-    every = np.arange(len(readings))
+    nearest = nearest_of(place, len(readings))
     # Between measurements, the number of turns is that of the nearest one.
-    nearest = np.searchsorted(0.5 * (place[1:] + place[:-1]), every)
     at_rows = readings[:, column] + (whole - measured)[nearest]
     is_jump = np.abs(np.diff(measured)) > 0.5 * turn
-    # Whether each measurement is one of those around a jump.
-    kernel = np.ones(2 * INTERPOLATED_NEARBY)
-    is_around = np.convolve(is_jump, kernel)[INTERPOLATED_NEARBY - 1 :][: len(measured)] > 0.0
-    is_near = is_around[nearest]
-    at_rows[is_near] = np.interp(every[is_near], place, whole)
+    at_rows = joined(at_rows, place, whole, is_jump)
     changed, values = np.array(readings), np.array(sampling.values)
     changed[:, column] = values[:, column] = at_rows
     values[rows, column] = whole
     return changed, replace(sampling, values=values)
+
+
+def nearest_of(place: Array, num_rows: int) -> NDArray[np.int64]:
+    """Returns the measurement nearest to each row, ``(R,)``.
+
+    Args:
+        place: Times of the measurements in steps, increasing, ``(M,)``.
+        num_rows: Number of rows R.
+    """
+    return np.searchsorted(0.5 * (place[1:] + place[:-1]), np.arange(num_rows))
+
+
+def joined(at_rows: Array, place: Array, measured: Array, is_jump: NDArray[np.bool_]) -> Array:
+    """Returns a channel at each row, interpolated anew around jumps that were removed.
+
+    Args:
+        at_rows: The channel without the jumps, ``(R,)``.
+        place: Times of the measurements in steps, increasing, ``(M,)``.
+        measured: The measurements without the jumps, ``(M,)``.
+        is_jump: Whether there was one after each measurement but the last, ``(M - 1,)``.
+    """
+    # Whether each measurement is one of those around a jump.
+    kernel = np.ones(2 * INTERPOLATED_NEARBY)
+    is_around = np.convolve(is_jump, kernel)[INTERPOLATED_NEARBY - 1 :][: len(measured)] > 0.0
+    is_near = is_around[nearest_of(place, len(at_rows))]
+    return np.where(is_near, np.interp(np.arange(len(at_rows)), place, measured), at_rows)

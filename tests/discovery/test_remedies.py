@@ -429,8 +429,10 @@ def test_a_refusal_after_a_fault_keeps_the_columns_names():
         repair(pendulum, frozen, npdr.DataOptions())
 
 
-@pytest.mark.parametrize(("lag", "is_applied"), [(0.2, False), (0.6, True)])
-def test_early_stamps_must_explain_more_than_a_lag_of_the_device(monkeypatch, lag, is_applied):
+@pytest.mark.parametrize(("lag", "is_applied"), [(0.2, False), (0.4, False), (0.8, True)])
+def test_early_stamps_must_explain_twice_as_well_as_a_lag_of_the_device(
+    monkeypatch, lag, is_applied
+):
     early = Shift(None, -3.0).remedy
 
     class Tried:
