@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from npdr_ppl.language.channels import Channel, Follower
 from npdr_ppl.rollouts.logs.inspection import SignalSummary
+from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_part
 from npdr_ppl.rollouts.logs.signal_names import Role, role_of
 
 __all__ = ["Column", "Match", "can_be_left_out", "columns_of", "matched"]
@@ -110,9 +111,10 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
 
     Columns of a role that do not match are taken in the order of the log if there are as many
     signals of this role, and no name contradicts it; those that follow from others do not count if
-    there is no signal for them. Numbers do not contradict, because some count
-    joints from 0 and others from 1. A measurement that never changes is no match. Positions and
-    velocities that are left can match signals whose role their names do not tell.
+    there is no signal for them. Numbers do not contradict, because some count joints from 0 and
+    others from 1. A measurement that never changes is no match. Positions and velocities that are
+    left can match signals whose role their names do not tell. Of a model of one floating body,
+    names such as ``qw`` and ``gyro_x`` tell parts of the pose.
 
     Args:
         columns: The columns.
@@ -125,8 +127,10 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
         if (signal := by_name.get(column.name)) is not None
         and (column.role == "command" or not signal.is_constant)
     }
+    result |= _of_a_pose(columns, signals, result)
+    taken = {match.signal.name for match in result.values()}
     columns = [column for column in columns if column.name not in result]
-    signals = [signal for signal in signals if signal.name not in result]
+    signals = [signal for signal in signals if signal.name not in taken]
     for role in dict.fromkeys(column.role for column in columns):
         wanted = [column for column in columns if column.role == role]
         own = [s for s in signals if s.role == role and (role == "command" or not s.is_constant)]
@@ -146,6 +150,32 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
     found = _by_name(left, unclear)
     doubt = "its name does not say what it measures"
     return result | {name: Match(signal, doubt) for name, signal in found.items()}
+
+
+def _of_a_pose(
+    columns: Sequence[Column], signals: Sequence[SignalSummary], known: Container[str]
+) -> dict[str, Match]:
+    """Returns the signals that are parts of the pose and velocity of a model's floating body.
+
+    Args:
+        columns: The columns.
+        signals: The signals.
+        known: Names of the columns whose signals are known.
+    """
+    parts = {column.name: pose_part(column.name) for column in columns}
+    if [part for part in parts.values() if part and part[0] == "orientation"] != [
+        ("orientation", axis) for axis in "wxyz"
+    ]:
+        return {}
+    by_part: dict[tuple[str, str], list[SignalSummary]] = {}
+    for signal in signals:
+        if not signal.is_constant and (part := pose_part(signal.name)) is not None:
+            by_part.setdefault(part, []).append(signal)
+    return {
+        name: Match(by_part[part][0], f"check that it is {FRAMES[part[0]]}")
+        for name, part in parts.items()
+        if name not in known and part is not None and len(by_part.get(part, ())) == 1
+    }
 
 
 def _of_one_role(

@@ -152,3 +152,46 @@ def test_a_position_matches_a_name_that_does_not_say_what_it_measures():
 )
 def test_a_unit_tells_what_a_name_does_not(name, unit, role):
     assert role_of(name, unit) == role
+
+
+FLOATING = columns_of(
+    [
+        *(Channel(f"root_{axis}", "m") for axis in "xyz"),
+        *(Channel(f"root_q{axis}", "1") for axis in "wxyz"),
+        *(Channel(f"root_{axis}_velocity", "m/s", rate_of=f"root_{axis}") for axis in "xyz"),
+        *(Channel(f"root_{axis}_spin", "rad/s") for axis in "xyz"),
+    ],
+    [Channel(f"thrust{number}", "1") for number in range(1, 5)],
+)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        ("{}", "q{}", "v{}", "gyro_{}"),
+        ("pose.position.{}", "pose.orientation.{}", "twist.linear.{}", "twist.angular.{}"),
+        ("/mocap/position/{}", "/mocap/quaternion/{}", "vel_{}", "omega_{}"),
+        ("pos{}", "quat_{}", "Vel{}", "angularVelocity.{}"),
+    ],
+)
+def test_the_parts_of_a_floating_bodys_pose_are_told_by_their_names(parts):
+    position, orientation, velocity, spin = parts
+    names = [
+        *(position.format(axis) for axis in "xyz"),
+        *(orientation.format(axis) for axis in "xyzw"),
+        *(velocity.format(axis) for axis in "xyz"),
+        *(spin.format(axis) for axis in "xyz"),
+        "accel_x", "mag_x", "battery",
+        *(f"motor{number}" for number in range(1, 5)),
+    ]  # fmt: skip
+    matches = found(FLOATING, names)
+    assert [matches[f"root_{axis}"][0] for axis in "xyz"] == names[:3]
+    assert [matches[f"root_q{axis}"][0] for axis in "xyzw"] == names[3:7]
+    assert [matches[f"root_{axis}_velocity"][0] for axis in "xyz"] == names[7:10]
+    assert [matches[f"root_{axis}_spin"][0] for axis in "xyz"] == names[10:13]
+    assert matches["root_qw"][1] == "check that it is from the body's frame to the world's"
+    assert [matches[f"thrust{number}"][0] for number in range(1, 5)] == names[-4:]
+
+
+def test_two_signals_for_a_part_of_a_pose_are_left_to_the_user():
+    assert "root_x" not in found(FLOATING, ["mocap.position.x", "ekf.position.x"])
