@@ -90,6 +90,15 @@ def test_a_rollout_may_start_in_motion(arm, tmp_path, name):
     assert error <= MOST_IN_PYTHON
 
 
+@pytest.mark.parametrize("name", ["actuator_lag", "input_delay"])
+def test_a_rollout_may_start_in_operation(arm, tmp_path, name):
+    effect = attachable(arm, effects()[name])
+    simulator = arm.with_effects(effect)
+    values = probed(simulator, effect)
+    error, *_ = difference(simulator, values, tmp_path, in_operation=True)
+    assert error <= MOST_IN_PYTHON
+
+
 def test_refined_steps_are_taken(arm, tmp_path):
     effect = attachable(arm, effects()["joint_elasticity"])
     simulator = arm.with_effects(effect, InputDelay("motor"))

@@ -1,5 +1,6 @@
 """Robots, effects, and how far an exported file with its Python is from the fitted model."""
 
+import dataclasses
 import runpy
 
 import mujoco
@@ -127,7 +128,7 @@ def refusals(simulator, values):
     return export_mjcf(simulator, given, time_step=CONTROL_STEP).refused
 
 
-def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0):
+def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0, in_operation=False):
     """Returns how far the exported robot is from the model, how much the effects matter, and how.
 
     Args:
@@ -136,6 +137,7 @@ def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0):
         folder: Folder of the new files.
         seconds: Time to simulate.
         velocity: Velocity of every joint at the start.
+        in_operation: Whether the first command was held before the start.
     """
     num_steps = round(seconds / CONTROL_STEP)
     given = {n: torch.tensor(float(v), dtype=torch.float64) for n, v in values.items()}
@@ -158,7 +160,7 @@ def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0):
         return float((data.qvel if component.is_velocity else data.qpos)[component.address])
 
     first = {component.channel.name: place(component) for component in simulator.components}
-    measured = {} if runner is None else runner.reset(data)
+    measured = {} if runner is None else runner.reset(data, commands[0] if in_operation else None)
     start = [measured.get(name, value) for name, value in first.items()]
     rows = []
     for command in commands:
@@ -176,6 +178,7 @@ def difference(simulator, values, folder, *, seconds=1.0, velocity=0.0):
         state_names=tuple(state.name for state in simulator.states),
         time_step=CONTROL_STEP,
     )
+    inputs = dataclasses.replace(inputs, began_in_operation=in_operation)
     wanted = simulator.simulate(given, inputs)[0].numpy()
     sensors = [sensor.name for sensor in simulator.sensors]
     plain = MujocoSimulator(simulator.file, sensors=sensors).simulate({}, inputs)[0].numpy()

@@ -64,17 +64,22 @@ class LawRunner:
         self.low = np.where(model.actuator_ctrllimited, low, -np.inf)
         self.high = np.where(model.actuator_ctrllimited, high, np.inf)
         self.is_started = False
+        self.before: Any = None
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
 
-    def reset(self, data: Any) -> dict[str, float]:
+    def reset(self, data: Any, commands_before: Any = None) -> dict[str, float]:
         """Starts a rollout in the present state of the data; returns the first measurements.
 
         The robot is taken to have rested before. Drifts and waves begin at ``data.time`` 0.
 
         Args:
             data: The ``mujoco.MjData``.
+            commands_before: The commands that were held before, one per actuator, such as those
+                that keep a drone in the air. By default, servos were at their first goal and
+                other commands at zero.
         """
         self.is_started = False
+        self.before = None if commands_before is None else np.array(commands_before, dtype=float)
         data.qfrc_applied[self.dofs] = 0.0
         for law, _, dof in self.forces:
             law.reset(float(data.qvel[dof]))
@@ -156,7 +161,8 @@ class LawRunner:
             # A servo has held its first goal; other commands were zero.
             gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
             is_goal = (gain != 0.0) & ((bias[:, 1] == -gain) | (bias[:, 2] == -gain))
-            before = np.where(is_goal, commands, 0.0)
+            before = np.where(is_goal, commands, 0.0) if self.before is None else self.before
+            before = np.minimum(np.maximum(before, self.low), self.high)
             for law, i in self.commands:
                 before[i] = law.settle(float(before[i]), step)
             self.is_started = True
