@@ -71,6 +71,9 @@ _FORCE = re.compile(r"_(torque|force)$")
 _CHANNEL = re.compile(r"(?<![\w./-])[A-Za-z0-9]+(?:_[A-Za-z0-9]+)+(?![\w/(]|\.\w)")
 """A name with underscores that is no file, option or call."""
 
+GROUPS = {"actuator": "commands", "input": "commands", "servo": "servos"}
+"""What the members of a group are, by the first word of an effect's id."""
+
 _SHARES = ("error", "skew")
 """Parameters that are relative errors; they are shown in per cent."""
 
@@ -93,7 +96,8 @@ def effect_title(effect: str, port: str) -> str:
         effect: Its id, such as ``"sensor_low_pass"``.
         port: Its port, such as ``"arm_velocity,pole_velocity"``.
     """
-    where = _where(port)
+    prefix = effect.partition("_")[0]
+    where = _where(port, GROUPS.get(prefix, "channels"))
     joint = _where(_FORCE.sub("", port))
     title = TITLES.get(effect)
     if title is None:
@@ -152,8 +156,13 @@ def cause_in_words(name: str) -> str:
     return in_words(name).replace("_", " ")
 
 
-def _where(port: str) -> str:
-    """Returns a port in words; of a group, what its channels have in common."""
+def _where(port: str, group: str = "channels") -> str:
+    """Returns a port in words; of a group, what its channels have in common.
+
+    Args:
+        port: The port.
+        group: What the members of a group are.
+    """
     channels = [channel.strip() for channel in port.split(",") if channel.strip()]
     words = [channel.split("_") for channel in channels]
     if len(channels) > 1:
@@ -162,8 +171,20 @@ def _where(port: str) -> str:
         if shared:
             return " ".join(shared)
         if len(channels) > MOST_PORTS:
-            return f"{len(channels)} channels"
+            return _numbered(channels) or f"{len(channels)} {group}"
     return " and ".join(" ".join(w) for w in words)
+
+
+def _numbered(channels: list[str]) -> str:
+    """Returns e.g. ``"thrust 1 to 4"`` for names that only count; empty for others."""
+    found = [re.fullmatch(r"(.*?)_?(\d+)", channel) for channel in channels]
+    names = {match.group(1) for match in found if match is not None and match.group(1)}
+    numbers = [int(match.group(2)) for match in found if match is not None]
+    if len(names) != 1 or len(numbers) < len(channels):
+        return ""
+    if numbers != [*range(numbers[0], numbers[0] + len(numbers))]:
+        return ""
+    return f"{names.pop().replace('_', ' ')} {numbers[0]} to {numbers[-1]}"
 
 
 def _shared(words: list[list[str]]) -> list[str]:
