@@ -87,9 +87,17 @@ def _expected_time(path: Path, robot: "MujocoSimulator") -> dict[str, float | No
 def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
     """Returns what is known of a robot, for JSON."""
     from npdr_ppl.rollouts.logs.matching import columns_of
+    from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_part
 
     rates = {state.name: state.rate_of for state in robot.states}
     limits = _joint_limits(robot)
+    floating = _free_joints(robot)
+    frames = {
+        sensor.name: FRAMES[part[0]]
+        for sensor in robot.sensors
+        if sensor.name.startswith(tuple(f"{joint}_" for joint in floating))
+        and (part := pose_part(sensor.name)) is not None
+    }
     # Of two joints that follow from each other, the first one follows.
     followers = {c.name for c in columns_of(robot.sensors, (), robot.followers) if c.follows}
 
@@ -100,6 +108,7 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
             "unit": channel.unit,
             "role": role,
             "range": ends if all(map(math.isfinite, ends)) else None,
+            "frame": frames.get(channel.name),
             "may be left out": channel.name in followers or rates.get(channel.name) is not None,
         }
 
@@ -123,7 +132,19 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
             *(column(c, "command") for c in robot.actions),
         ],
         "ports": [{"name": p.name, "kind": p.kind, "unit": p.unit} for p in robot.ports],
+        "free joints": floating,
     }
+
+
+def _free_joints(robot: "MujocoSimulator") -> list[str]:
+    """Returns the names of the joints by which bodies float."""
+    import mujoco
+
+    from npdr_ppl.engines.mujoco.fields import element_names
+
+    names = element_names(robot.model, "joint")
+    is_free = robot.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    return [name for name, free in zip(names, is_free, strict=True) if free]
 
 
 def _joint_limits(robot: "MujocoSimulator") -> dict[str, list[float]]:
@@ -164,6 +185,11 @@ def _lines(found: dict[str, Any]) -> list[str]:
         lines += [f"  {field}: {reason}" for field, reason in found["not varied"].items()]
     hint = "npdr inspect LOG --model FILE --write MAPPING"
     lines += ["", *column_lines(found, hint), "", *port_lines(found)]
+    for joint in found["free joints"]:
+        lines += [
+            f"  Forces on the free joint {joint}, such as drag, are not searched for; see",
+            '  "A free joint" in docs/bring_your_simulator.md.',
+        ]
     expected = found["expected time"]
     if expected["first fit"] is not None:
         first = words_for(expected["first fit"])
@@ -194,6 +220,8 @@ def column_lines(found: dict[str, Any], hint: str) -> list[str]:
             remark = "may be left out"
         if c["role"] == "command":
             remark = f"command, {span}" if span else "command"
+        if c.get("frame"):
+            remark = f"{remark}; {c['frame']}" if remark else c["frame"]
         rows.append((c["name"], c["unit"], remark))
     lines = in_columns(rows)
     if not any(c["role"] == "command" for c in found["columns"]):
