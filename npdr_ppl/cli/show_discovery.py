@@ -228,6 +228,12 @@ def _show_candidates(console: Console, found: Mapping[str, Any]) -> None:
             f"{row['p_value']:.2g}",
         )
     console.print(table)
+    console.print(
+        "The effect that explains most is first. separation: between the recordings with and "
+        "without it, in standard deviations; absorbed: the share of its change that parameters "
+        "explain; p: probability that chance alone explains as much.",
+        highlight=False,
+    )
     alarm = found["alarm"]
     word = "alarm" if alarm["fired"] else "no alarm"
     console.print(f"[bold]{word}[/bold], p = {alarm['p_value']:.2g}", highlight=False)
