@@ -9,9 +9,10 @@ itself is fitted to them.
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -181,10 +182,41 @@ def estimate_starts(
                 departure.rate_errors,
             )
         )
+        for this, leader, slope in _followers(box.simulator, rollouts, values[own]):
+            shift[:, this], rate[:, this] = slope * shift[:, leader], slope * rate[:, leader]
+            error[:, this] = rate_error[:, this] = 0.0
         new = InitialStates(values[own] + shift, rates[own] + rate, error, rate_error)
         is_better = is_reported & (new.values + new.rates).isfinite()
         found = found.replaced(own, new, is_better)
     return found
+
+
+def _followers(
+    simulator: Simulator, rollouts: Rollouts, values: Tensor
+) -> Iterator[tuple[int, int, Tensor]]:
+    """Yields the positions that were not measured because they follow from others.
+
+    The model's difference between the two is kept: the joints of a gripper are not tied rigidly.
+
+    Args:
+        simulator: The simulator.
+        rollouts: The recording.
+        values: Values of the channels, ``(n, channels)``.
+
+    Returns:
+        Column of each, that of the position which it follows, and the slope there, ``(n,)``.
+    """
+    names = rollouts.channel_names
+    for follower in simulator.followers:
+        is_there = follower.name in names and follower.leader in rollouts.measured_names
+        if is_there and follower.name not in rollouts.measured_names:
+            leader = names.index(follower.leader)
+            slope = np.polynomial.Polynomial(follower.coefficients).deriv()
+            yield (
+                names.index(follower.name),
+                leader,
+                torch.as_tensor(slope(values[:, leader].numpy())),
+            )
 
 
 def _first_usable(rollouts: Rollouts, rollout: int, step: int) -> int:

@@ -1,12 +1,17 @@
 """A gripper with fingers that an equality ties, behind a servo whose command has its own unit."""
 
 import numpy as np
+import pyro
+import pyro.distributions as dist
 import pytest
+import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco.derived_model import derive_model
 from npdr_ppl.engines.mujoco.fields import find_field
 from npdr_ppl.language.channels import Channel, Follower
+from npdr_ppl.preparation.initial_states import estimate_starts
+from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import with_followers
 from npdr_ppl.rollouts.logs.matching import can_be_left_out, columns_of
@@ -82,3 +87,40 @@ def test_the_gains_of_a_servo_whose_command_has_its_own_unit(gripper):
     assert find_field(model, "actuator grip kv").nominal == 20.0
     names = {p.name for p in derive_model(gripper()).parameters}
     assert {"grip_kp", "grip_kv"} & names
+
+
+def test_a_segment_begins_with_the_fingers_as_far_apart_as_the_model_has_them(gripper):
+    # The constraint is soft, and one finger is heavier.
+    path = gripper("0 1 0 0 0")
+    text = path.read_text().replace('mass=".1"', 'mass=".5"', 1)
+    apart = '<option timestep="0.002"><flag contact="disable"/></option>'
+    path.write_text(text.replace('<option timestep="0.002"/>', apart))
+    simulator = npdr.MujocoSimulator(path, {"damping": "joint left damping"}, time_step=0.01)
+    commands = 120.0 + 100.0 * np.sign(np.sin(0.15 * np.arange(200)))[:, None]
+    whole = Rollouts.from_arrays(
+        readings=[np.zeros((201, 4))], actions=[commands], action_names=("grip",), time_step=0.01,
+        channel_names=[channel.name for channel in simulator.states],
+    )  # fmt: skip
+    moved = simulator.simulate({}, whole.inputs(None, "recorded")).reshape(200, 4).numpy()
+    names = whole.channel_names
+    right, left = (np.append(0.0, moved[:, names.index(name)]) for name in ("right", "left"))
+    assert np.abs(right - left).max() > 1e-4
+
+    def model(inputs):
+        damping = pyro.sample("damping", dist.Uniform(5.0, 15.0))
+        return npdr.simulate("trajectory", simulator, {"damping": damping}, inputs, noise=None)
+
+    noise = np.random.default_rng(0).normal(0.0, 1e-6, len(right))
+    recording = Rollouts.from_arrays(
+        readings=[(right + noise)[:, None]], actions=[commands], channel_names=("right",),
+        action_names=("grip",), time_step=0.01,
+    )  # fmt: skip
+    rollouts = with_followers(recording, simulator.followers)
+    segments = SegmentModel(model, rollouts, npdr.DataOptions(segment_length=20))
+    z = segments.place_of({"damping": torch.tensor(10.0)})
+    starts = estimate_starts(segments.black_box(z[None]), segments.inputs, rollouts)
+    later = segments.inputs.start[1:]
+    column = rollouts.channel_names.index("left")
+    wrong = segments.inputs.initial_values[1:, column].numpy() - left[later]
+    found = starts.values[1:, column].numpy() - left[later]
+    assert np.abs(found).max() < 0.1 * np.abs(wrong).max()

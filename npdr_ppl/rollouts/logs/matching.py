@@ -33,6 +33,7 @@ class Column(NamedTuple):
         role: What it is; the role of an action is ``"command"``.
         rate_of: The position whose rate it is; ``None`` for others.
         follows: The position that it follows from; ``None`` for others.
+        leads: The position that follows from it, and the other way round; ``None`` for others.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Column(NamedTuple):
     role: Role
     rate_of: str | None = None
     follows: str | None = None
+    leads: str | None = None
 
 
 class Match(NamedTuple):
@@ -69,9 +71,18 @@ def columns_of(
     for follower in followers:
         if follower.name not in follows and follower.leader not in follows:
             follows[follower.name] = follower.leader
+    pairs = {(follower.name, follower.leader) for follower in followers}
+    leads = {leader: name for name, leader in follows.items() if (leader, name) in pairs}
     return [
         *(
-            Column(c.name, c.unit, _role_of_sensor(c), c.rate_of, follows.get(c.name))
+            Column(
+                c.name,
+                c.unit,
+                _role_of_sensor(c),
+                c.rate_of,
+                follows.get(c.name),
+                leads.get(c.name),
+            )
             for c in sensors
         ),
         *(Column(c.name, c.unit, "command") for c in actions),
@@ -89,7 +100,8 @@ def can_be_left_out(
         present: Names of those that are present.
     """
     position = next((c for c in columns if c.name == column.rate_of), column)
-    return column.rate_of in present or position.follows in present
+    known = {column.rate_of, position.follows, position.leads} - {None}
+    return any(name in present for name in known)
 
 
 def _role_of_sensor(channel: Channel) -> Role:
@@ -134,7 +146,7 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
     for role in dict.fromkeys(column.role for column in columns):
         wanted = [column for column in columns if column.role == role]
         own = [s for s in signals if s.role == role and (role == "command" or not s.is_constant)]
-        leading = [column for column in wanted if column.follows is None]
+        leading = _measured(wanted, own)
         wanted = leading if len(own) == len(leading) else wanted
         doubt = ""
         if role == "command" and not own:
@@ -150,6 +162,22 @@ def matched(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> dict
     found = _by_name(left, unclear)
     doubt = "its name does not say what it measures"
     return result | {name: Match(signal, doubt) for name, signal in found.items()}
+
+
+def _measured(columns: Sequence[Column], signals: Sequence[SignalSummary]) -> list[Column]:
+    """Returns the columns without those that follow from others.
+
+    Of two that follow from each other, as the fingers of a gripper, the one that a signal names is
+    measured.
+    """
+    named = _by_name(columns, signals)
+    by_name = {column.name: column for column in columns}
+    instead = {
+        column.name: by_name[column.leads]
+        for column in columns
+        if column.leads in by_name and column.leads in named and column.name not in named
+    }
+    return [instead.get(column.name, column) for column in columns if column.follows is None]
 
 
 def _of_a_pose(

@@ -2,10 +2,10 @@
 
 import pytest
 
-from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.channels import Channel, Follower
 from npdr_ppl.models.furuta import Furuta
 from npdr_ppl.rollouts.logs.inspection import SignalSummary
-from npdr_ppl.rollouts.logs.matching import columns_of, matched
+from npdr_ppl.rollouts.logs.matching import can_be_left_out, columns_of, matched
 from npdr_ppl.rollouts.logs.signal_names import role_of
 
 SENSORS = [
@@ -195,3 +195,20 @@ def test_the_parts_of_a_floating_bodys_pose_are_told_by_their_names(parts):
 
 def test_two_signals_for_a_part_of_a_pose_are_left_to_the_user():
     assert "root_x" not in found(FLOATING, ["mocap.position.x", "ekf.position.x"])
+
+
+def test_of_two_fingers_the_one_that_a_signal_names_is_measured():
+    fingers = [Channel("finger_joint1", "m"), Channel("finger_joint2", "m")]
+    both_ways = [
+        Follower("finger_joint1", "finger_joint2", (0.0, 1.0)),
+        Follower("finger_joint2", "finger_joint1", (0.0, 1.0)),
+    ]
+    columns = columns_of([Channel("wrist", "rad"), *fingers], [], both_ways)
+    for finger in ("finger_joint1", "finger_joint2"):
+        matches = found(columns, ["wrist_pos", f"{finger}_pos"])
+        assert matches == {"wrist": ("wrist_pos", ""), finger: (f"{finger}_pos", "")}
+        (other,) = (column for column in columns[1:] if column.name != finger)
+        assert can_be_left_out(other, columns, matches)
+    # One direction only: the leader has to be measured.
+    columns = columns_of(fingers, [], both_ways[:1])
+    assert not can_be_left_out(columns[1], columns, {"finger_joint1"})
