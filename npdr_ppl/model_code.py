@@ -37,7 +37,7 @@ class ModelCode:
             through others, by path.
         named: Files whose names the code has in quotation marks.
         is_alone: Whether the text means the same in another folder: it imports no neighbours, and
-            names files by their whole paths only.
+            names no file beside it.
     """
 
     file: Path | None = None
@@ -98,15 +98,16 @@ def _place(model: Any) -> tuple[Path, str, str]:
 
     Raises:
         OSError: There is no such file.
-        TypeError: There is none.
+        TypeError: It is built in.
     """
     definition = inspect.unwrap(model)
     while isinstance(definition, functools.partial):
         definition = inspect.unwrap(definition.func)
     if not inspect.isroutine(definition):
         definition = type(definition)
-    # What a factory made, or an instance of a class, has its arguments where it has its name.
-    for module in (sys.modules.get(definition.__module__), *loaded_files()):
+    # The arguments of a factory or a class are in the file that gives the model its name.
+    defining, script = map(sys.modules.get, (definition.__module__, "__main__"))
+    for module in (defining, *loaded_files(), script):
         names = [name for name, value in list(vars(module or object).items()) if value is model]
         file = getattr(module, "__file__", None)
         if names and file:
@@ -154,7 +155,8 @@ def _files_of(module: str, folder: Path) -> list[Path]:
         return []
     packages = [Path(place) for place in spec.submodule_search_locations or ()]
     if packages:
-        return sorted(f for p in packages if p.parent == folder for f in p.rglob("*.py"))
+        own = [place for place in packages if folder in (place, place.parent)]
+        return sorted(file for place in own for file in place.rglob("*.py"))
     file = Path(spec.origin or "")
     return [file] if file.parent == folder and file.suffix == ".py" else []
 

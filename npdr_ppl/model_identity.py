@@ -18,7 +18,6 @@ from npdr_ppl.language.wider_priors import ModelWithWiderPriors
 from npdr_ppl.python_files import class_file, is_importable
 
 __all__ = [
-    "described",
     "engine_settings",
     "model_name",
     "source_text",
@@ -63,7 +62,7 @@ def source_text(model: Any) -> str:
     between two runs, the file's text is returned, too.
     """
     if isinstance(model, ModelWithEffects):
-        attached = "\n".join(f"# with {described(e)}" for e, _ in model.effects)
+        attached = "\n".join(f"# with {_described(e)}" for e, _ in model.effects)
         return f"{source_text(model.base)}\n{attached}"
     if _is_wrapped(model):
         return f"{source_text(model.args[-1])}\n# under {type(model.args[0]).__name__}"
@@ -89,7 +88,7 @@ def unwrapped(model: Any) -> tuple[Any, list[Effect]]:
             return model, effects
 
 
-def described(effect: Effect) -> str:
+def _described(effect: Effect) -> str:
     """Returns an effect's arguments, and the text of the user's file that defines it if any."""
     return f"{effect!r}{_own_file(effect)}"
 

@@ -45,7 +45,8 @@ def untouched(monkeypatch):
     """Leaves path and modules as they were."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     yield
-    sys.modules.pop("npdr_code_neighbour", None)
+    for name in [name for name in sys.modules if name.startswith("npdr_code_")]:
+        del sys.modules[name]
 
 
 @pytest.fixture
@@ -98,6 +99,21 @@ def test_packages_beside_a_model_count_with_all_their_files(folder, module):
     before = code_checksum(load_function(file, "own"))
     assert checksum_after(folder, f"{module}/plant.py", "__init__", "reset") != before
     assert checksum_after(folder, f"{module}/template.py", "name", "title") != before
+
+
+def test_modules_of_the_models_own_package_count(folder):
+    package = folder / "npdr_code_package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "physics.py").write_text(NEIGHBOUR)
+    text = (folder / "own.py").read_text()
+    text = text.replace("npdr_code_neighbour", "npdr_code_package.physics")
+    (package / "model.py").write_text(text)
+    sys.path.insert(0, str(folder))
+    before = code_checksum(load_function(package / "model.py", "own"))
+    file = package / "physics.py"
+    file.write_text(file.read_text().replace("__init__", "reset"))
+    assert code_checksum(load_function(package / "model.py", "own")) != before
 
 
 def test_the_checksum_is_the_same_in_every_process(folder):

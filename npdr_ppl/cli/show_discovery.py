@@ -229,9 +229,9 @@ def _show_candidates(console: Console, found: Mapping[str, Any]) -> None:
         )
     console.print(table)
     console.print(
-        "The effect that explains most is first. separation: between the recordings with and "
-        "without it, in standard deviations; absorbed: the share of its change that parameters "
-        "explain; p: probability that chance alone explains as much.",
+        "The effect that explains most is first. separation: distance between simulations with "
+        "and without it, in standard deviations; absorbed: the share of its change that "
+        "parameters explain; p: probability that chance alone explains as much.",
         highlight=False,
     )
     alarm = found["alarm"]

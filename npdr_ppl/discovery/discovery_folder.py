@@ -57,7 +57,7 @@ class DiscoveryFolder:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Keeps the fits inside the block for the next run."""
+        """Keeps the fits inside the block for the next run, whose code :meth:`begin` checks."""
         with keep_fits(self.path / FITS):
             yield
 

@@ -127,7 +127,10 @@ def _base(model: Model) -> tuple[str, str, Path | None]:
     module, code = inspect.getmodule(model), code_of(model)
     name = code.name or getattr(model, "__name__", type(model).__name__)
     doc = f'"""{name} with the effects that it was missing."""'
-    is_there = module is not None and code.file in (None, Path(module.__file__ or ""))
+    is_there = module is not None and code.file in (
+        None,
+        Path(getattr(module, "__file__", None) or ""),
+    )
     if module is not None and is_there and is_importable(module.__name__):
         return f"{doc}\n\nfrom {module.__name__} import {name}", name, None
     if code.file is None:

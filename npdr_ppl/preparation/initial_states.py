@@ -196,15 +196,13 @@ def _followers(
 ) -> Iterator[tuple[int, int, Tensor]]:
     """Yields the positions that were not measured because they follow from others.
 
-    The model's difference between the two is kept: the joints of a gripper are not tied rigidly.
+    Of each its column, that of the position which it follows, and the slope there, ``(n,)``. The
+    simulated difference from the exact coupling is kept, because a constraint is not rigid.
 
     Args:
         simulator: The simulator.
         rollouts: The recording.
         values: Values of the channels, ``(n, channels)``.
-
-    Returns:
-        Column of each, that of the position which it follows, and the slope there, ``(n,)``.
     """
     names = rollouts.channel_names
     for follower in simulator.followers:

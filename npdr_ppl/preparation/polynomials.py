@@ -55,7 +55,7 @@ def fit_polynomial(
         importance: Weights of the m squared errors in the choice of the degree, ``(m,)``.
         most_degree: Greatest degree.
         least_degree: Least degree.
-        points_per_coefficient: Number of points for each coefficient that there must be more of.
+        points_per_coefficient: There must be more than this many points for each coefficient.
         penalties: Penalties of squared coefficients, per point, of which the best is taken (ridge
             regression). The constant is not penalised.
 
@@ -67,7 +67,7 @@ def fit_polynomial(
     middle = (weight.square() * values).sum(0) / weight.square().sum()
     wanted = weight * (values - middle)
     for degree in range(least_degree, most_degree + 1):
-        # As many coefficients as points have no error to choose a degree by.
+        # With as many coefficients as points, the error says nothing about the degree.
         if points_per_coefficient * num_terms(points.shape[1], degree) >= len(points):
             break
         left, sizes, right = torch.linalg.svd(

@@ -381,8 +381,8 @@ class ResidualSurrogateSettings:
         least_share: Effective share of the tested draws from which the polynomials can be used.
         enough_share: Effective share from which further fits would not pay.
         margin: Factor of the number of draws beyond what the tested ones predict.
-        unlikely_share: A draw of another density is likely if this share of the own draws is less
-            likely than it.
+        unlikely_share: Quantile of the own draws' log densities, above which a draw of another
+            density counts as likely.
         even_share: Effective share of the points at which chains begin.
         num_walkers: Number of chains.
         fewest_sweeps: Number of moves of each at first; it is doubled until chains are mixed.

@@ -48,8 +48,8 @@ def surrogate_draws(
         report: Called with a short status after each test of polynomials.
 
     Returns:
-        ``None`` if polynomials do not represent the residuals, or leave out a mode, or if they
-        would take too much memory.
+        ``None`` if polynomials do not represent the residuals, or leave out a mode, if chains do
+        not mix, or if there are too many parameters or measurements.
     """
     settings, d = RESIDUAL_SURROGATE, len(likelihood.fit.z)
     num_first = max(settings.fewest_first, math.ceil(1.25 * num_terms(d, 2)))
@@ -234,7 +234,7 @@ class _Tested:
         return self.is_close and self.is_mixed
 
     def enough(self, simulated: "_Simulated", iterations: int) -> WeightedDraws:
-        """Returns as many simulated draws as a posterior needs."""
+        """Returns as many simulated draws as a posterior needs, or all that were made."""
         settings = RESIDUAL_SURROGATE
         number = math.ceil(IMPORTANCE_SAMPLING.enough_effective / self.share * settings.margin)
         w = self.made[: max(number, len(self.values))]
@@ -274,7 +274,7 @@ def _made(
     """Returns draws of a density by Markov chains, which begin at simulated points.
 
     The number of sweeps is doubled until the chains have forgotten where they were after half of
-    them. Also returned is whether they have before the greatest number.
+    them. Also returns whether they had within ``most_sweeps``.
     """
     settings = RESIDUAL_SURROGATE
     # The points of the fit are among those where the polynomials are known.

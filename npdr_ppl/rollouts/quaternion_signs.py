@@ -23,6 +23,9 @@ AXES = "wxyz"
 NORM = 0.1
 """Difference of a quaternion's norm from one up to which four channels are one."""
 
+MOST = 0.9
+"""Least share of the rows with such a norm; others are dropouts."""
+
 
 def continuous(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
     """Returns rollouts in which quaternions do not change their sign, with a remark about each.
@@ -51,7 +54,11 @@ def _quaternion_continuous(rollouts: Rollouts, stem: str) -> Rollouts:
         total += number
     if not total:
         return rollouts
-    remark = Remark(f"{stem}w … {stem}z change their sign together {total} times; undone.")
+    rows = "row" if total == 1 else "rows"
+    remark = Remark(
+        f"The quaternion {stem}w … {stem}z changes its sign at {total} {rows}, which is the same "
+        "orientation; its signs were made continuous."
+    )
     return replace(
         rollouts,
         readings=tuple(readings for readings, _ in made),
@@ -65,10 +72,13 @@ def _without_flips(
 ) -> tuple[Array, Sampling, int]:
     """Returns readings and measurements of a rollout without changes of sign, and their number."""
     rows = np.flatnonzero(sampling.is_read[:, columns].all(1))
+    is_unit = np.abs(np.linalg.norm(sampling.values[rows][:, columns], axis=1) - 1.0) < NORM
+    if len(rows) < 2 or is_unit.mean() < MOST:
+        return readings, sampling, 0
+    rows = rows[is_unit]
     measured = sampling.values[rows][:, columns]
-    norms = np.linalg.norm(measured, axis=1)
     is_flip = (measured[1:] * measured[:-1]).sum(1) < 0.0
-    if not is_flip.any() or not (np.abs(norms - 1.0) < NORM).all():
+    if not is_flip.any():
         return readings, sampling, 0
     signs = np.concatenate(([1.0], np.where(is_flip, -1.0, 1.0).cumprod()))
     changed, values = np.array(readings), np.array(sampling.values)

@@ -73,3 +73,11 @@ def test_forces_are_the_least_where_positions_depend_on_each_other(size):
     for matrix, accelerations, force in zip(inertia[11:], caused[11:], found[11:], strict=True):
         least = np.linalg.lstsq(matrix.numpy(), accelerations.numpy(), rcond=1e-9)[0]
         assert np.allclose(force, least, rtol=1e-5, atol=1e-6)
+
+
+def test_forces_of_two_joints_are_compiled_without_a_branch():
+    compiled = torch.compile(forces_of, fullgraph=True, backend="eager")
+    accelerations = tuple(torch.tensor([[1.0, 2.0], [3.0, 4.0]]).double())
+    inertia = ((torch.tensor([2.0, 1.0]).double(), 0.0), (0.0, torch.tensor([1.0, 0.0]).double()))
+    first, second = compiled(accelerations, inertia)
+    assert first.tolist() == [0.5, 2.0] and second.tolist() == [3.0, 0.0]

@@ -39,8 +39,16 @@ def test_signs_that_change_together_are_undone():
     found = continuous(recorded(flipped(turning())), CHANNELS)
     assert found.readings[0] == pytest.approx(turning())
     (note,) = found.notes
-    assert "base_qw … base_qz change their sign together 6 times" in note
+    assert "base_qw … base_qz changes its sign at 6 rows" in note
     assert not faults_among(found.notes)
+
+
+def test_a_dropout_does_not_hide_changes_of_sign():
+    quaternions = flipped(turning())
+    quaternions[100] = 0.0
+    found = continuous(recorded(quaternions), CHANNELS)
+    others = np.arange(len(quaternions)) != 100
+    assert found.readings[0][others] == pytest.approx(turning()[others])
 
 
 def test_late_measurements_do_not_blur_a_change_of_sign():

@@ -243,26 +243,44 @@ def forces_of(accelerations: Components, inertia: tuple[Components, ...]) -> Com
     """
     if len(accelerations) == 1:
         return (accelerations[0] / inertia[0][0],)
-    size = accelerations[0].shape
     if len(accelerations) == 2:
-        (a, b), (c, d) = inertia
-        determinant = a * d - b * c
-        is_singular = determinant.abs() <= SINGULAR * ((a * d).abs() + (b * c).abs())
-        first = (d * accelerations[0] - b * accelerations[1]) / determinant
-        second = (a * accelerations[1] - c * accelerations[0]) / determinant
-        if not bool(is_singular.any()):
-            return first, second
-        found, is_singular = torch.stack((first, second), dim=-1), is_singular.expand(size)
-    rows = [torch.stack([entry.expand(size) for entry in row], dim=-1) for row in inertia]
+        return _forces_of_two(accelerations, inertia)
+    size = accelerations[0].shape
+    rows = [torch.stack([_tensor(e, size) for e in row], dim=-1) for row in inertia]
     matrix, wanted = torch.stack(rows, dim=-2), torch.stack(accelerations, dim=-1)[..., None]
-    if len(accelerations) > 2:
-        factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
-        found = torch.linalg.lu_solve(factors, pivots, wanted)[..., 0]
-        sizes = factors.diagonal(dim1=-2, dim2=-1).abs()
-        is_singular = sizes.amin(-1) <= SINGULAR * sizes.amax(-1)
+    factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
+    found = torch.linalg.lu_solve(factors, pivots, wanted)[..., 0]
+    sizes = factors.diagonal(dim1=-2, dim2=-1).abs()
     # A simulation that has diverged stays as it is.
-    is_singular = is_singular & matrix.isfinite().all(-1).all(-1)
+    is_singular = (sizes.amin(-1) <= _least(matrix) * sizes.amax(-1)) & matrix.isfinite().all(
+        -1
+    ).all(-1)
     if bool(is_singular.any()):
-        inverse = torch.linalg.pinv(matrix[is_singular], rtol=SINGULAR)
+        inverse = torch.linalg.pinv(matrix[is_singular], rtol=_least(matrix))
         found[is_singular] = (inverse @ wanted[is_singular])[..., 0]
     return found.unbind(-1)
+
+
+def _forces_of_two(accelerations: Components, inertia: tuple[Components, ...]) -> Components:
+    """Returns the forces of two joints without a branch, so that it can be compiled."""
+    x, y = accelerations
+    (a, b), (c, d) = ([_tensor(entry, x.shape) for entry in row] for row in inertia)
+    determinant = a * d - b * c
+    is_singular = determinant.abs() <= _least(x) * ((a * d).abs() + (b * c).abs())
+    regular = torch.where(is_singular, 1.0, determinant)
+    # The pseudoinverse of a matrix of rank one is its transpose over the sum of its squares.
+    squares = (a * a + b * b + c * c + d * d).clamp_min(torch.finfo(x.dtype).tiny)
+    return (
+        torch.where(is_singular, (a * x + c * y) / squares, (d * x - b * y) / regular),
+        torch.where(is_singular, (b * x + d * y) / squares, (a * y - c * x) / regular),
+    )
+
+
+def _tensor(entry: Tensor | float, size: torch.Size) -> Tensor:
+    """Returns an entry of W, which may be declared as a number, for each simulation."""
+    return torch.as_tensor(entry).expand(size)
+
+
+def _least(values: Tensor) -> float:
+    """Returns the pivot below which a matrix is singular, for the precision of its values."""
+    return max(SINGULAR, 16.0 * torch.finfo(values.dtype).eps)

@@ -190,6 +190,7 @@ def _of_a_pose(
         signals: The signals.
         known: Names of the columns whose signals are known.
     """
+    columns = [column for column in columns if column.role != "command"]
     parts = {column.name: pose_part(column.name) for column in columns}
     if [part for part in parts.values() if part and part[0] == "orientation"] != [
         ("orientation", axis) for axis in "wxyz"
@@ -197,7 +198,9 @@ def _of_a_pose(
         return {}
     by_part: dict[tuple[str, str], list[SignalSummary]] = {}
     for signal in signals:
-        if not signal.is_constant and (part := pose_part(signal.name)) is not None:
+        if signal.is_constant or signal.role == "command" or signal.name in known:
+            continue
+        if (part := pose_part(signal.name)) is not None:
             by_part.setdefault(part, []).append(signal)
     return {
         name: Match(by_part[part][0], f"check that it is {FRAMES[part[0]]}")

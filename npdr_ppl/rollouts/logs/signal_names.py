@@ -37,7 +37,7 @@ _ROLES: tuple[tuple[Role, re.Pattern[str]], ...] = (
             r"observation[._]state|pose|deg)([^a-z]|$)"
         ),
     ),
-    ("command", re.compile(r"^(.*[^a-z])?(motor|rotor|thrust|throttle|esc|servo)_$")),
+    ("command", re.compile(r"^(.*[^a-z])?(motor|rotor|thrust|throttle|esc|servo)[^a-z]+$")),
 )
 """What the names of signals usually mean, the first match first."""
 

@@ -193,6 +193,15 @@ def test_the_parts_of_a_floating_bodys_pose_are_told_by_their_names(parts):
     assert [matches[f"thrust{number}"][0] for number in range(1, 5)] == names[-4:]
 
 
+@pytest.mark.parametrize("motor", ["motor{}", "rotor_{}", "thrust[{}]", "esc_{}"])
+def test_commands_are_no_part_of_a_pose(motor):
+    names = [f"q{axis}" for axis in "wxyz"]
+    names += [motor.format(number) for number in range(1, 5)]
+    assert found(FLOATING, names)["thrust1"][0] == motor.format(1)
+    matches = found(FLOATING, [*names, "target_position_x"])
+    assert "root_x" not in matches and matches["root_qz"][0] == "qz"
+
+
 def test_two_signals_for_a_part_of_a_pose_are_left_to_the_user():
     assert "root_x" not in found(FLOATING, ["mocap.position.x", "ekf.position.x"])
 
