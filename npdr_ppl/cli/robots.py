@@ -1,5 +1,6 @@
 """What `npdr inspect` says about a robot's file: parameters, columns of a log, and ports."""
 
+import importlib
 import json
 import math
 import os
@@ -138,10 +139,9 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
 
 def _free_joints(robot: "MujocoSimulator") -> list[str]:
     """Returns the names of the joints by which bodies float."""
-    import mujoco
-
     from npdr_ppl.engines.mujoco.fields import element_names
 
+    mujoco: Any = importlib.import_module("mujoco")
     names = element_names(robot.model, "joint")
     is_free = robot.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     return [name for name, free in zip(names, is_free, strict=True) if free]
