@@ -28,7 +28,7 @@ __all__ = ["keep_fits", "keeping", "made_or_read"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-VERSION = 10
+VERSION = 11
 """Raised when fits end elsewhere than before, so that those of earlier versions are not read."""
 
 _KEPT: ContextVar[tuple[Path | None, str]] = ContextVar("kept_fits", default=(None, ""))

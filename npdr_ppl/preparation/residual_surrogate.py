@@ -26,7 +26,7 @@ class ResidualSurrogate:
         degree: Their degree.
         squares: Products of their coefficients, summed over the residuals, ``(terms, terms)``.
         inverse: Inverse of the information about their coefficients, ``(terms, terms)``.
-        farthest: Leverage of the farther points of the fit.
+        farthest: Leverage of the farther points of the fit, each as if it were left out.
     """
 
     middle: Tensor

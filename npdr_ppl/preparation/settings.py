@@ -361,10 +361,11 @@ class ResidualSurrogateSettings:
         most_bytes: Most memory for the residuals to which polynomials are fitted.
         draw_factor: Number of draws for each first simulation; those outside the prior's support
             are dropped.
-        points_per_term: Polynomials are fitted to the most likely points: at least to this many
-            for each term of a quadratic, to half of all points, and to all that are near.
-        near: Difference of the log density from the greatest up to which points are near, for each
-            parameter. For draws of a normal density, it is a half on average.
+        points_per_term: Polynomials are fitted to the points with the smallest residuals: at least
+            to this many for each term of a quadratic, to half of all points, and to all that are
+            near.
+        near: Difference of the log likelihood from the greatest up to which points are near, for
+            each parameter. For draws of a normal density, it is a half on average.
         most_degree: Greatest degree of the polynomials.
         penalties: Penalties of squared coefficients, per point, of which the one with the smallest
             leave-one-out error is taken.

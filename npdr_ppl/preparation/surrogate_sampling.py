@@ -253,19 +253,18 @@ def _tested(
     """
     settings = RESIDUAL_SURROGATE
     density = _posterior(simulated.space, fitted, reach)
-    tested = None
-    for most_sweeps in (settings.fewest_sweeps, settings.most_sweeps):
+
+    def tested(most_sweeps: int) -> _Tested:
         made, is_mixed = _made(simulated, density, most_sweeps, seed)
         made = made[torch.randperm(len(made), generator=torch.Generator().manual_seed(seed))]
         # Weights do not show what draws are kept from: the outermost ones do.
         farthest = float(fitted.leverage(made).quantile(settings.outermost))
         values = simulated.add(made[: settings.tested])
-        is_cut = farthest > 0.5 * reach
-        tested = _Tested(made, density, values, is_mixed, is_cut, least_share)
-        if is_mixed or not tested.is_close:
-            break
-    assert tested is not None
-    return tested
+        return _Tested(made, density, values, is_mixed, farthest > 0.5 * reach, least_share)
+
+    found = tested(settings.fewest_sweeps)
+    is_worth_it = found.is_close and not found.is_mixed
+    return tested(settings.most_sweeps) if is_worth_it else found
 
 
 def _made(

@@ -13,8 +13,8 @@ from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.container import Rollouts
 from npdr_ppl.rollouts.notes import Remark
+from npdr_ppl.rollouts.removed_jumps import joined, nearest_of, rewritten
 from npdr_ppl.rollouts.sampling import Sampling
-from npdr_ppl.rollouts.wrapped_angles import joined, nearest_of
 
 __all__ = ["continuous"]
 
@@ -59,12 +59,7 @@ def _quaternion_continuous(rollouts: Rollouts, stem: str) -> Rollouts:
         f"The quaternion {stem}w … {stem}z changes its sign at {total} {rows}, which is the same "
         "orientation; its signs were made continuous."
     )
-    return replace(
-        rollouts,
-        readings=tuple(readings for readings, _ in made),
-        samplings=tuple(sampling for _, sampling in made) if rollouts.samplings else (),
-        notes=(*rollouts.notes, remark),
-    )
+    return rewritten(rollouts, made, remark)
 
 
 def _without_flips(

@@ -15,9 +15,10 @@ from npdr_ppl.language.channels import Channel
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.container import Rollouts
 from npdr_ppl.rollouts.notes import Remark
+from npdr_ppl.rollouts.removed_jumps import joined, nearest_of, rewritten
 from npdr_ppl.rollouts.sampling import Sampling
 
-__all__ = ["joined", "nearest_of", "unwrapped"]
+__all__ = ["unwrapped"]
 
 TURNS = ((2.0 * math.pi, "rad"), (360.0, "degrees"))
 """A whole turn in each unit. A log may be in degrees without saying so."""
@@ -32,10 +33,6 @@ NEARBY = 5
 SMOOTH = 2.0
 """Change across a jump, a whole turn subtracted, up to which the motion goes on across it, in the
 largest change nearby."""
-
-INTERPOLATED_NEARBY = 3
-"""Number of measurements on either side of a jump around which readings are interpolated anew: a
-reading between measurements depends on three of them on either side."""
 
 
 def unwrapped(rollouts: Rollouts, channels: Sequence[Channel]) -> Rollouts:
@@ -74,12 +71,7 @@ def _channel_unwrapped(rollouts: Rollouts, name: str) -> Rollouts:
         f"{name} stays between {low:.4g} and {high:.4g} {unit} and jumps by whole turns, which "
         "are added up."
     )
-    return replace(
-        rollouts,
-        readings=tuple(readings for readings, _ in made),
-        samplings=tuple(sampling for _, sampling in made) if rollouts.samplings else (),
-        notes=(*rollouts.notes, remark),
-    )
+    return rewritten(rollouts, made, remark)
 
 
 def _is_wrapped(series: Sequence[Array], turn: float) -> bool:
@@ -121,29 +113,3 @@ def _with_turns_added(
     changed[:, column] = values[:, column] = at_rows
     values[rows, column] = whole
     return changed, replace(sampling, values=values)
-
-
-def nearest_of(place: Array, num_rows: int) -> NDArray[np.int64]:
-    """Returns the measurement nearest to each row, ``(R,)``.
-
-    Args:
-        place: Times of the measurements in steps, increasing, ``(M,)``.
-        num_rows: Number of rows R.
-    """
-    return np.searchsorted(0.5 * (place[1:] + place[:-1]), np.arange(num_rows))
-
-
-def joined(at_rows: Array, place: Array, measured: Array, is_jump: NDArray[np.bool_]) -> Array:
-    """Returns a channel at each row, interpolated anew around jumps that were removed.
-
-    Args:
-        at_rows: The channel without the jumps, ``(R,)``.
-        place: Times of the measurements in steps, increasing, ``(M,)``.
-        measured: The measurements without the jumps, ``(M,)``.
-        is_jump: Whether there was one after each measurement but the last, ``(M - 1,)``.
-    """
-    # Whether each measurement is one of those around a jump.
-    kernel = np.ones(2 * INTERPOLATED_NEARBY)
-    is_around = np.convolve(is_jump, kernel)[INTERPOLATED_NEARBY - 1 :][: len(measured)] > 0.0
-    is_near = is_around[nearest_of(place, len(at_rows))]
-    return np.where(is_near, np.interp(np.arange(len(at_rows)), place, measured), at_rows)
