@@ -10,13 +10,16 @@ from npdr_ppl.discovery.screening import settings as screening_settings
 from npdr_ppl.discovery.search import settings as search_settings
 from npdr_ppl.planning import settings as planning_settings
 from npdr_ppl.posterior import settings as posterior_settings
+from npdr_ppl.preparation import sampling_settings
 from npdr_ppl.preparation import settings as preparation_settings
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, SEGMENT_FIT
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING
+from npdr_ppl.preparation.settings import SEGMENT_FIT
 
 STAGES = [
     getattr(module, name)
     for module in (
         preparation_settings,
+        sampling_settings,
         discovery_settings,
         screening_settings,
         search_settings,

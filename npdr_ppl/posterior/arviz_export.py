@@ -13,7 +13,7 @@ from npdr_ppl.posterior.exported_checks import ATTRIBUTE
 from npdr_ppl.posterior.parameter_units import parameter_units
 from npdr_ppl.preparation.draw_budget import affordable_draws, executed_in_parts
 from npdr_ppl.preparation.effective_share import effective_share
-from npdr_ppl.preparation.settings import DRAW_BUDGET
+from npdr_ppl.preparation.sampling_settings import DRAW_BUDGET
 from npdr_ppl.randomness import seeded
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ __all__ = ["to_arviz"]
 MAX_PREDICTIVE_DRAWS = 100
 """Number of posterior predictive draws of each member. All of them have log likelihoods. The
 number of trajectories that are kept is limited by
-:data:`~npdr_ppl.preparation.settings.DRAW_BUDGET`."""
+:data:`~npdr_ppl.preparation.sampling_settings.DRAW_BUDGET`."""
 
 MAX_PRIOR_PREDICTIVE_DRAWS = 50
 """Prior predictive draws, those of the first prior draws; enough to see what the prior allows."""

@@ -22,8 +22,8 @@ from npdr_ppl.language.prior import Prior
 from npdr_ppl.posterior.settings import ESTIMATOR_CHECK
 from npdr_ppl.preparation.importance_sampling import sample_posterior
 from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
 from npdr_ppl.preparation.weighted_draws import WeightedDraws, effective_size, smoothed_weights
 from npdr_ppl.randomness import seeded
 

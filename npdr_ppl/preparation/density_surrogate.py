@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.preparation.polynomials import Polynomial, fit_polynomial
-from npdr_ppl.preparation.settings import DENSITY_SURROGATE
+from npdr_ppl.preparation.sampling_settings import DENSITY_SURROGATE
 
 __all__ = ["DensitySurrogate"]
 

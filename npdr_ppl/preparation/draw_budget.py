@@ -6,7 +6,7 @@ from torch import Tensor
 
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.memory import release_freed_memory
-from npdr_ppl.preparation.settings import DRAW_BUDGET
+from npdr_ppl.preparation.sampling_settings import DRAW_BUDGET
 
 __all__ = ["affordable_draws", "executed_in_parts"]
 

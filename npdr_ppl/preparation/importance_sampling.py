@@ -26,8 +26,8 @@ from npdr_ppl.inference.parts.samplers.importance_weights import longest_step, s
 from npdr_ppl.inference.parts.samplers.walkers import ensemble_draws
 from npdr_ppl.preparation.density_surrogate import DensitySurrogate
 from npdr_ppl.preparation.ridges import RidgeCoordinates, log_density_of
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
 from npdr_ppl.preparation.surrogate_sampling import surrogate_draws
 from npdr_ppl.preparation.weighted_draws import WeightedDraws, effective_size, smoothed_weights
 from npdr_ppl.randomness import derived_seed, seeded

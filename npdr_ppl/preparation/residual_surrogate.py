@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.preparation.polynomials import fit_polynomial, monomials, num_terms
-from npdr_ppl.preparation.settings import RESIDUAL_SURROGATE
+from npdr_ppl.preparation.sampling_settings import RESIDUAL_SURROGATE
 
 __all__ = ["ResidualSurrogate"]
 

@@ -27,8 +27,8 @@ from npdr_ppl.inference.parts.samplers.walkers import LogDensity
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.preparation.polynomials import Polynomial, fit_polynomial, num_terms
 from npdr_ppl.preparation.sampling_coordinates import SamplingCoordinates
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING, RIDGE
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, RIDGE
 from npdr_ppl.randomness import seeded
 
 __all__ = ["RidgeCoordinates", "log_density_of"]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError
 from npdr_ppl.language.prior import Prior
-from npdr_ppl.preparation.settings import SAMPLING_COORDINATES
+from npdr_ppl.preparation.sampling_settings import SAMPLING_COORDINATES
 
 __all__ = ["SamplingCoordinates"]
 

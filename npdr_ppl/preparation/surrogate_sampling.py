@@ -21,8 +21,8 @@ from npdr_ppl.inference.parts.samplers.walkers import LogDensity, ensemble_draws
 from npdr_ppl.preparation.polynomials import num_terms
 from npdr_ppl.preparation.residual_surrogate import ResidualSurrogate
 from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING, RESIDUAL_SURROGATE
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING, RESIDUAL_SURROGATE
 from npdr_ppl.preparation.weighted_draws import WeightedDraws, effective_size, smoothed_weights
 from npdr_ppl.randomness import derived_seed, seeded
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.preparation.ridges import RidgeCoordinates
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING
 
 __all__ = ["WeightedDraws", "effective_size", "smoothed_weights"]
 

@@ -17,7 +17,7 @@ from npdr_ppl.preparation.binding import bind
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.draw_budget import affordable_draws
 from npdr_ppl.preparation.effective_share import effective_share
-from npdr_ppl.preparation.settings import DRAW_BUDGET
+from npdr_ppl.preparation.sampling_settings import DRAW_BUDGET
 
 DRAWS = 30
 """Of each of two members."""

@@ -10,8 +10,8 @@ from npdr_ppl.posterior.prepare import prepare
 from npdr_ppl.preparation.data_options import DataOptions
 from npdr_ppl.preparation.residual_surrogate import ResidualSurrogate
 from npdr_ppl.preparation.ridges import RidgeCoordinates
+from npdr_ppl.preparation.sampling_settings import RESIDUAL_SURROGATE
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
-from npdr_ppl.preparation.settings import RESIDUAL_SURROGATE
 from npdr_ppl.preparation.surrogate_sampling import surrogate_draws
 from tests.helpers.pendulum_recordings import links, product, swinging
 

@@ -11,7 +11,7 @@ from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.proof.settings import INTERVALS
 from npdr_ppl.inference.parts.samplers.importance_weights import systematic
 from npdr_ppl.preparation.importance_sampling import laplace_draws, sample_posterior
-from npdr_ppl.preparation.settings import IMPORTANCE_SAMPLING
+from npdr_ppl.preparation.sampling_settings import IMPORTANCE_SAMPLING
 from npdr_ppl.randomness import derived_seed
 
 __all__ = ["Draws", "Estimate", "estimates", "posterior_draws", "quick_draws"]

@@ -20,7 +20,7 @@ from npdr_ppl.posterior.comparison.comparison_result import Comparison
 from npdr_ppl.posterior.parameter_units import parameter_units
 from npdr_ppl.preparation.draw_budget import affordable_draws
 from npdr_ppl.preparation.evaluation import replay
-from npdr_ppl.preparation.settings import DRAW_BUDGET
+from npdr_ppl.preparation.sampling_settings import DRAW_BUDGET
 from npdr_ppl.progress import Step
 from npdr_ppl.randomness import seeded
 from npdr_ppl.rollouts import Rollouts
