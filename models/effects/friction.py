@@ -26,6 +26,7 @@ class ViscousFriction(LinearForceEffect):
     """−b v with damping b; not distinguishable from a motor's back-EMF."""
 
     id = "viscous_friction"
+    acts_on_floating = True
     standard_law = "damping"
     parameters = (Parameter("damping", "{port} s/{coordinate}", 0.0, "force per speed b"),)
     law = "−b v"
@@ -144,6 +145,7 @@ class QuadraticDrag(LinearForceEffect):
     """−c v|v| with drag c."""
 
     id = "quadratic_drag"
+    acts_on_floating = True
     parameters = (Parameter("drag", "{port} s²/{coordinate}²", 0.0, "force per squared speed c"),)
     law = "−c v|v|"
     excitation = "wide_range"

@@ -88,17 +88,13 @@ def _expected_time(path: Path, robot: "MujocoSimulator") -> dict[str, float | No
 def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, Any]:
     """Returns what is known of a robot, for JSON."""
     from npdr_ppl.rollouts.logs.matching import columns_of
-    from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_part
+    from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_parts
 
     rates = {state.name: state.rate_of for state in robot.states}
     limits = _joint_limits(robot)
-    floating = _free_joints(robot)
-    frames = {
-        sensor.name: FRAMES[part[0]]
-        for sensor in robot.sensors
-        if sensor.name.startswith(tuple(f"{joint}_" for joint in floating))
-        and (part := pose_part(sensor.name)) is not None
-    }
+    floating = tuple(f"{joint}_" for joint in _free_joints(robot))
+    parts = pose_parts([s.name for s in robot.sensors if s.name.startswith(floating)])
+    frames = {name: FRAMES[part] for name, (part, _) in parts.items()}
     # Of two joints that follow from each other, the first one follows.
     followers = {c.name for c in columns_of(robot.sensors, (), robot.followers) if c.follows}
 
@@ -132,8 +128,10 @@ def _described(derived: "DerivedModel", robot: "MujocoSimulator") -> dict[str, A
             *(column(c, "measurement") for c in robot.sensors),
             *(column(c, "command") for c in robot.actions),
         ],
-        "ports": [{"name": p.name, "kind": p.kind, "unit": p.unit} for p in robot.ports],
-        "free joints": floating,
+        "ports": [
+            {"name": p.name, "kind": p.kind, "unit": p.unit, "is floating": p.is_floating}
+            for p in robot.ports
+        ],
     }
 
 
@@ -153,7 +151,7 @@ def _joint_limits(robot: "MujocoSimulator") -> dict[str, list[float]]:
     They show whether the file's angles were read in the unit that was meant.
     """
     model = robot.model
-    joints = {port.position: port.joint for port in robot.force_ports}  # hinges and slides
+    joints = {p.position: p.joint for p in robot.force_ports if p.position is not None}
     return {
         state.name: model.jnt_range[joints[component.address]].tolist()
         for component, state in zip(robot.components, robot.states, strict=True)
@@ -185,11 +183,6 @@ def _lines(found: dict[str, Any]) -> list[str]:
         lines += [f"  {field}: {reason}" for field, reason in found["not varied"].items()]
     hint = "npdr inspect LOG --model FILE --write MAPPING"
     lines += ["", *column_lines(found, hint), "", *port_lines(found)]
-    for joint in found["free joints"]:
-        lines += [
-            f"  Forces on the free joint {joint}, such as drag, are not searched for; see",
-            '  "A free joint" in docs/bring_your_simulator.md.',
-        ]
     expected = found["expected time"]
     if expected["first fit"] is not None:
         first = words_for(expected["first fit"])
@@ -232,8 +225,13 @@ def column_lines(found: dict[str, Any], hint: str) -> list[str]:
 def port_lines(found: dict[str, Any]) -> list[str]:
     """Returns the lines about the ports of a model, which ``found`` describes."""
     lines = ["Ports, where effects attach (npdr effects) by --effect PORT.EFFECT:"]
-    for kind in dict.fromkeys(port["kind"] for port in found["ports"]):
-        same = [port for port in found["ports"] if port["kind"] == kind]
+
+    def title(port: dict[str, Any]) -> str:
+        floats = " on a floating body, along and about its own axes"
+        return str(port["kind"]) + (floats if port.get("is floating") else "")
+
+    for kind in dict.fromkeys(map(title, found["ports"])):
+        same = [port for port in found["ports"] if title(port) == kind]
         names = [f"{p['name']} [{p['unit']}]" if p["unit"] else p["name"] for p in same]
         # A name stays in one line with its unit, which may have spaces in it.
         whole = [name.replace(" ", _NO_BREAK) for name in names]

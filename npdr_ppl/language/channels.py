@@ -91,6 +91,8 @@ class Port:
         joint: Name of the port of the force at the joint that a servo moves; empty if there is
             none.
         is_driven: Whether an actuator drives the joint that a force acts on.
+        is_floating: Whether a force acts along, or a torque about, an axis of a floating body.
+            Such an axis has a velocity, but no position, and no bearing in which it rubs.
     """
 
     name: str
@@ -103,6 +105,7 @@ class Port:
     is_driven: bool = True
     rated_force: float = 1.0
     joint: str = ""
+    is_floating: bool = False
 
     @property
     def follows_position(self) -> bool:

@@ -135,9 +135,10 @@ class Simulator(ABC):
 
     @property
     def joints_of_unknown_speed(self) -> Mapping[str, str]:
-        """Force ports whose rated speed is a guess, and the state that is their joint's position.
+        """Force ports whose rated speed is a guess, and the state that tells how fast they move.
 
-        There are none where the author of the model states the speeds.
+        It is the joint's position, or the spin of a body that floats. There are none where the
+        author of the model states the speeds.
         """
         return {}
 

@@ -1,4 +1,4 @@
-"""A floating body: as a free joint, or as a ball joint on slides, where forces can act on it."""
+"""A floating body, as a free joint or as a ball joint on slides, and the forces at its axes."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,11 @@ import torch
 
 import npdr_ppl as npdr
 from npdr_ppl.engines.mujoco import MujocoSimulator
-from npdr_ppl.models.effects import ViscousFriction
+from npdr_ppl.errors import ModelError
+from npdr_ppl.language.inputs import Inputs
+from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag, ViscousFriction, effects
 from tests.helpers.command_line import run
+from tests.helpers.exported_robots import difference
 
 BODY = """
 <mujoco>
@@ -23,6 +26,7 @@ BODY = """
 </mujoco>
 """
 FREE = '<freejoint name="root"/>'
+PORTS = tuple(f"root_{axis}_{kind}" for kind in ("force", "torque") for axis in "xyz")
 SLIDES = """
 <joint name="root_x" type="slide" axis="1 0 0"/>
 <joint name="root_y" type="slide" axis="0 1 0"/>
@@ -64,22 +68,100 @@ def test_slides_and_a_ball_joint_move_as_a_free_joint_and_have_its_columns(tmp_p
     other, _ = flown(slides, height=0.0)
     other[:, names.index("root_z")] += 1.0
     assert own.numpy() == pytest.approx(other.numpy(), abs=1e-9)
-    assert not free.joints and {"root_x_force", "root_y_force"} <= set(slides.joints)
+    assert free.joints == slides.joints == PORTS
 
 
-def test_inspect_tells_frames_and_how_to_get_forces(tmp_path, monkeypatch, capsys):
+def test_inspect_tells_frames_and_ports(tmp_path, monkeypatch, capsys):
     robot(tmp_path, FREE, "free.xml")
     code, out, _ = run(monkeypatch, capsys, "inspect", tmp_path / "free.xml")
     assert code == 0
     assert "rad/s  about the body's own axes" in out
-    assert "Forces on the free joint root, such as drag, are not searched for" in out
+    assert "force on a floating body, along and about its own axes: root_x_force [N]" in out
 
 
-def test_drag_acts_on_slides(tmp_path):
-    drag = ViscousFriction("root_x_force")
-    slides = robot(tmp_path, SLIDES, "slides.xml").with_effects(drag)
-    values = {drag.parameter_names[0]: torch.tensor([0.3]).double()}
-    slowed, names = flown(slides, values)
-    free, _ = flown(robot(tmp_path, SLIDES, "slides.xml"))
-    column = names.index("root_x_velocity")
-    assert slowed[10, column] < free[10, column]
+ADRIFT = """
+<mujoco>
+  <option timestep="0.001" gravity="0 0 0"/>
+  <worldbody>
+    <body name="hull">
+      <freejoint name="root"/>
+      <inertial pos="0 0 0" mass="2" diaginertia="0.1 0.2 0.2"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def drifting(tmp_path, effect, value, start):
+    """Returns the states of a body that nothing else moves, after each of 100 steps of 0.01 s."""
+    path = tmp_path / "hull.xml"
+    path.write_text(ADRIFT)
+    simulator = MujocoSimulator(path, time_step=0.01).with_effects(effect)
+    names = [state.name for state in simulator.states]
+    rest = {"root_qw": 1.0} | start
+    inputs = Inputs.single(
+        torch.zeros(100, 0).double(),
+        torch.tensor([rest.get(name, 0.0) for name in names]).double(),
+        action_names=(),
+        state_names=tuple(names),
+        time_step=0.01,
+    )
+    found = simulator.simulate({effect.parameter_names[0]: torch.tensor([value])}, inputs)
+    return {name: found.reshape(100, -1)[:, i].numpy() for i, name in enumerate(names)}
+
+
+TIME = 0.01 * np.arange(1, 101)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_drag_acts_along_the_axes_of_the_body(tmp_path, axis):
+    # The body points along the world's y-axis, and moves there.
+    turned = {"root_qw": 0.5**0.5, "root_qz": 0.5**0.5, "root_y_velocity": 3.0}
+    found = drifting(tmp_path, ViscousFriction(f"root_{axis}_force"), 1.5, turned)
+    decay = np.exp(-1.5 / 2.0 * TIME) if axis == "x" else np.ones(100)
+    assert found["root_y_velocity"] == pytest.approx(3.0 * decay, rel=1e-3)
+    assert np.abs(found["root_x_velocity"]).max() < 1e-9
+
+
+def test_drag_turns_with_the_body(tmp_path):
+    # v' = −(c/m) (e·v) e with e = (cos ωt, sin ωt), here by steps of 0.1 ms.
+    start = {"root_x_velocity": 1.0, "root_z_spin": 4.0}
+    found = drifting(tmp_path, ViscousFriction("root_x_force"), 3.0, start)
+    velocity, wanted = np.array([1.0, 0.0]), []
+    for k in range(10_000):
+        angle = 4.0 * (k + 0.5) * 1e-4
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        velocity = velocity - 1e-4 * 1.5 * (axis @ velocity) * axis
+        if (k + 1) % 100 == 0:
+            wanted.append(velocity)
+    both = np.stack([found["root_x_velocity"], found["root_y_velocity"]], axis=1)
+    assert both == pytest.approx(np.array(wanted), abs=2e-3)
+
+
+def test_drag_about_an_axis_slows_the_spin(tmp_path):
+    found = drifting(tmp_path, QuadraticDrag("root_y_torque"), 0.3, {"root_y_spin": 5.0})
+    assert found["root_y_spin"] == pytest.approx(5.0 / (1.0 + 1.5 * 5.0 * TIME), rel=5e-3)
+
+
+def test_what_needs_a_bearing_or_a_position_is_refused(tmp_path):
+    simulator = robot(tmp_path, FREE, "free.xml")
+    suited = {
+        name
+        for name, effect in effects().items()
+        if "force" in effect.port_kinds
+        and effect("root_x_force").suits(simulator.port("root_x_force"))
+    }
+    assert suited == {"viscous_friction", "quadratic_drag"}
+    with pytest.raises(ModelError, match="coulomb_friction makes no sense at the port 'root_x_"):
+        simulator.with_effects(CoulombFriction("root_x_force"))
+
+
+@pytest.mark.parametrize("port", ["root_x_force", "root_y_torque"])
+@pytest.mark.parametrize("joints", [FREE, SLIDES], ids=["free", "slides"])
+def test_an_exported_body_drags_as_ours(tmp_path, joints, port):
+    drags = [ViscousFriction(port), QuadraticDrag("root_z_force")]
+    simulator = robot(tmp_path, joints, "own.xml").with_effects(*drags)
+    values = {drag.parameter_names[0]: 0.3 for drag in drags}
+    error, matters, _ = difference(simulator, values, tmp_path, velocity=0.5)
+    assert error < 1e-4
+    assert matters > 1e-3

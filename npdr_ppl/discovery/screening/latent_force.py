@@ -31,6 +31,7 @@ class Pulse(TimedForceEffect):
     """A constant force during a part of each segment."""
 
     id = "pulse"
+    acts_on_floating = True
     start_positions: Tensor | None = None
     """The joint's positions at the starts of the segments, once they were simulated."""
     parameters = (

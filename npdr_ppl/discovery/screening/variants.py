@@ -59,11 +59,13 @@ def _recorded_speeds(hypothesis: Hypothesis) -> dict[str, float]:
     segments, result = hypothesis.segments, {}
     if segments.recorded_rates is None:
         return result
-    channels = segments.inputs.channel_names
-    for port, position in hypothesis.simulator.joints_of_unknown_speed.items():
-        if position in channels:
-            rates = segments.recorded_rates[..., channels.index(position)]
-            least = LEAST_SPEED * hypothesis.simulator.port(port).rated_speed
+    channels, simulator = segments.inputs.channel_names, hypothesis.simulator
+    is_rate = {s.name: rate for s, rate in zip(simulator.states, simulator.is_rate, strict=True)}
+    for port, state in simulator.joints_of_unknown_speed.items():
+        if state in channels:
+            values = segments.inputs.initial_values if is_rate[state] else segments.recorded_rates
+            rates = values[..., channels.index(state)]
+            least = LEAST_SPEED * simulator.port(port).rated_speed
             result[port] = max(least, float(rates.nan_to_num(0.0).abs().max()))
     return result
 

@@ -150,8 +150,16 @@ class MujocoMechanism(ClosedLoopSimulator):
 
     @property
     def joints_of_unknown_speed(self) -> dict[str, str]:
-        """All force ports: an MJCF does not tell how fast its joints move."""
-        return self.position_states
+        """All force ports: an MJCF does not tell how fast its joints and bodies move."""
+        states = {(c.is_velocity, c.address): c.channel.name for c in self.components}
+        found = dict(self.position_states)
+        for port in (p for p in self.force_ports if p.port.is_floating):
+            place = True, port.velocity
+            if port.axis is not None:
+                place = False, int(self.model.jnt_qposadr[port.joint]) + port.axis
+            if place in states:
+                found[port.port.name] = states[place]
+        return found
 
     @property
     def position_states(self) -> dict[str, str]:
@@ -159,7 +167,11 @@ class MujocoMechanism(ClosedLoopSimulator):
         states = zip(self.components, self.states, strict=True)
         names = {c.address: state.name for c, state in states if not c.is_velocity}
         ports = self.force_ports
-        return {p.port.name: names[p.position] for p in ports if p.position in names}
+        return {
+            p.port.name: names[p.position]
+            for p in ports
+            if p.position is not None and p.position in names
+        }
 
     @property
     def followers(self) -> tuple[Follower, ...]:
@@ -329,6 +341,7 @@ class MujocoMechanism(ClosedLoopSimulator):
             for port in self.force_ports
             for effect in self.effects
             if isinstance(effect, ForceEffect) and effect.port == port.port.name
+            if not port.port.is_floating  # where nothing rubs
         }
         # If the file has dry friction, or a parameter sets it, the file's solver settings stay.
         width = int(self.model.dof_solimp.shape[1])

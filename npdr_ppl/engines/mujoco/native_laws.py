@@ -31,7 +31,8 @@ def is_native(
     """
     mujoco: Any = importlib.import_module("mujoco")
     off = int(model.opt.disableflags)
-    if not _has_own_law(effect):
+    # A file has one damping for all axes of a floating body.
+    if port.port.is_floating or not _has_own_law(effect):
         return False
     if effect.standard_law == "damping":
         return not off & int(mujoco.mjtDisableBit.mjDSBL_DAMPER)

@@ -3,7 +3,8 @@
 import importlib
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -26,25 +27,36 @@ _NUM_POSES = 32
 ``benchmarks/servo_arms.py``, their mean differs by at most a fifth from that of 2000 poses."""
 
 
+@dataclass(frozen=True)
 class ForcePort:
-    """A hinge or slide on which forces of effects act.
+    """A hinge, a slide or an axis of a floating body, on which forces of effects act.
 
     Attributes:
         port: The port with its ratings.
         joint: Number of the joint.
-        position: Its index in qpos.
-        velocity: Its index in qvel.
+        position: Its index in qpos; ``None`` for an axis of a floating body.
+        velocity: Its index in qvel; for an axis with a number, that of the world's axis.
+        axis: Number of the body's axis along which the force acts, for forces on a floating body.
+            The engine has their velocities in the world's frame.
     """
 
-    def __init__(self, port: Port, joint: int, position: int, velocity: int) -> None:
-        self.port = port
-        self.joint = joint
-        self.position = position
-        self.velocity = velocity
+    port: Port
+    joint: int
+    position: int | None
+    velocity: int
+    axis: int | None = None
+
+    @property
+    def in_world(self) -> slice:
+        """Indices in qvel of the velocity in the world's frame, for an axis with a number."""
+        first = self.velocity - (self.axis or 0)
+        return slice(first, first + 3)
 
 
 def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
-    """Returns the force ports of all hinges and slides.
+    """Returns the force ports of all joints.
+
+    Hinges and slides have one, floating bodies one per axis; see :func:`_floating_ports`.
 
     A port has the name of its joint, or ``<joint>_torque`` (``_force`` for slides) if a channel
     has that name. The rated force is the greatest force of the actuators at the joint; where the
@@ -67,6 +79,7 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     for joint, name in enumerate(element_names(model, "joint")):
         is_slide = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
         if not is_slide and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_HINGE):
+            result += _floating_ports(model, joint, name, inertias, taken)
             continue
         dof = int(model.jnt_dofadr[joint])
         inertia, damping = float(inertias[dof]), float(model.dof_damping[dof])
@@ -96,6 +109,48 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     return tuple(result)
 
 
+def _floating_ports(
+    model: Any, joint: int, name: str, inertias: Array, taken: Sequence[str]
+) -> list[ForcePort]:
+    """Returns the ports of a free joint or a ball: forces and torques at the body's own axes.
+
+    The rated force is the body's weight, with all that it carries. The rated torque is the weight
+    at the radius of gyration about the axis.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        joint: Number of the joint.
+        name: Its name.
+        inertias: Mean inertia about each degree of freedom.
+        taken: Names of channels.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    first, body = int(model.jnt_dofadr[joint]), int(model.jnt_bodyid[joint])
+    is_free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    mass = float(model.body_subtreemass[body])
+    gravity = float(np.linalg.norm(model.opt.gravity)) or 9.81
+    kinds = ("force", "torque") if is_free else ("torque",)
+    result = []
+    for k, (kind, axis) in enumerate(product(kinds, "xyz")):
+        is_force, dof = kind == "force", first + k
+        radius = math.sqrt(max(float(inertias[dof]), 1e-12) / max(mass, 1e-12))
+        rated = mass * gravity * (1.0 if is_force else radius)
+        travel = 1.0  # m or rad, as at other joints
+        own = f"{name}_{axis}_{kind}"
+        port = Port(
+            own if own not in taken else f"{own}_at_joint",
+            "force",
+            "N" if is_force else "N m",
+            rated,
+            math.sqrt(2.0 * rated * travel / (mass if is_force else max(inertias[dof], 1e-12))),
+            coordinate="m" if is_force else "rad",
+            is_driven=False,
+            is_floating=True,
+        )
+        result.append(ForcePort(port, joint, None, dof, k if is_force else None))
+    return result
+
+
 def derive_ports(
     model: Any,
     joints: Sequence[ForcePort],
@@ -103,7 +158,7 @@ def derive_ports(
     sensors: Sequence[Component | Reading],
 ) -> tuple[Port, ...]:
     """Returns the ports of actions, joints and sensors; actions are those of all actuators."""
-    by_position = {joint.position: joint for joint in joints}
+    by_position = {j.position: j for j in joints if j.position is not None}
     by_velocity = {joint.velocity: joint for joint in joints}
     ports = [_command_port(model, i, a, joints) for i, a in enumerate(actions)]
     ports += [joint.port for joint in joints]

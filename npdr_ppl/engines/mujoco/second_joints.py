@@ -118,11 +118,11 @@ class WithSecondJoints:
 
     def port(self, old: ForcePort) -> ForcePort:
         """Returns a joint's port at its new address."""
-        return ForcePort(
-            old.port,
-            int(self.joints[old.joint]),
-            int(self.positions[old.position]),
-            int(self.velocities[old.velocity]),
+        return replace(
+            old,
+            joint=int(self.joints[old.joint]),
+            position=None if old.position is None else int(self.positions[old.position]),
+            velocity=int(self.velocities[old.velocity]),
         )
 
     def pose(self, old: NDArray[np.float64]) -> NDArray[np.float64]:

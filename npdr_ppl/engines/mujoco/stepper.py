@@ -19,6 +19,7 @@ from npdr_ppl.engines.mujoco.damping import fastest_damping
 from npdr_ppl.engines.mujoco.drive_forces import DriveForces, has_direct_drives
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
+from npdr_ppl.engines.mujoco.ports import ForcePort
 from npdr_ppl.engines.mujoco.second_joints import IMMOVABLE
 from npdr_ppl.engines.mujoco.servos import ServoErrors
 
@@ -26,6 +27,9 @@ __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 
 ACCELERATION_STAGE = 3
 """Stage of sensors that depend on accelerations."""
+
+_TO_QUATERNION = 3
+"""Of a free joint's positions, the number of those before its orientation."""
 
 _MOST_DAMPED_PER_PART = 0.5
 """Rate of the fastest damping, per part of a step, up to which the midpoint rule follows it: its
@@ -248,12 +252,32 @@ class MujocoStepper(EffectChain):
     def at_joints(
         self, positions: Components, velocities: Components
     ) -> tuple[Components, Components]:
-        """Returns position and velocity of every hinge and slide."""
+        """Returns position and velocity at every force port; NaN where there is no position."""
         ports = self.simulator.force_ports
+        unknown = torch.full((len(self._qpos),), torch.nan, dtype=torch.float64)
         return (
-            tuple(_column(self._qpos, port.position) for port in ports),
-            tuple(_column(self._qvel, port.velocity) for port in ports),
+            tuple(
+                unknown if p.position is None else _column(self._qpos, p.position) for p in ports
+            ),
+            tuple(self._velocity(port) for port in ports),
         )
+
+    def _velocity(self, port: ForcePort) -> Tensor:
+        if port.axis is None:
+            return _column(self._qvel, port.velocity)
+        along = self._direction(port) * self._qvel[:, port.in_world]
+        return torch.from_numpy(along.sum(axis=1))
+
+    def _direction(self, port: ForcePort) -> NDArray[np.float64]:
+        """Returns the axis of a floating body in the world's frame, ``(N, 3)``."""
+        first = int(self.simulator.model.jnt_qposadr[port.joint]) + _TO_QUATERNION
+        w, *xyz = self._qpos[:, first : first + 4].T / np.linalg.norm(
+            self._qpos[:, first : first + 4], axis=1
+        )
+        vector, axis = np.stack(xyz, axis=1), np.eye(3)[port.axis]
+        # Rodrigues' rotation of the axis by a unit quaternion.
+        turned = np.cross(vector, axis)
+        return axis + 2.0 * (w[:, None] * turned + np.cross(vector, turned))
 
     @property
     def position_channels(self) -> tuple[str | None, ...]:
@@ -336,9 +360,16 @@ class MujocoStepper(EffectChain):
         if before_step:
             # Removes the previous step's forces of effects that need their joint's state first.
             self._applied[:] = 0.0
+        along = []
         for port, force in zip(ports, forces, strict=True):
-            if force is not None:
+            if force is not None and port.axis is None:
                 self._applied[:, port.velocity] = force.numpy()
+            elif force is not None:
+                along.append((port, force.numpy()))
+        for port, _ in along:
+            self._applied[:, port.in_world] = 0.0
+        for port, force in along:
+            self._applied[:, port.in_world] += self._direction(port) * force[:, None]
         if before_step:
             if self._friction is not None:
                 present, own = self._friction

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from npdr_ppl.language.channels import Channel, Follower
 from npdr_ppl.rollouts.logs.inspection import SignalSummary
-from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_part
+from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_part, pose_parts
 from npdr_ppl.rollouts.logs.signal_names import Role, role_of
 
 __all__ = ["Column", "Match", "can_be_left_out", "columns_of", "matched"]
@@ -191,8 +191,8 @@ def _of_a_pose(
         known: Names of the columns whose signals are known.
     """
     columns = [column for column in columns if column.role != "command"]
-    parts = {column.name: pose_part(column.name) for column in columns}
-    if [part for part in parts.values() if part and part[0] == "orientation"] != [
+    parts = pose_parts([column.name for column in columns])
+    if [part for part in parts.values() if part[0] == "orientation"] != [
         ("orientation", axis) for axis in "wxyz"
     ]:
         return {}
@@ -205,7 +205,7 @@ def _of_a_pose(
     return {
         name: Match(by_part[part][0], f"check that it is {FRAMES[part[0]]}")
         for name, part in parts.items()
-        if name not in known and part is not None and len(by_part.get(part, ())) == 1
+        if name not in known and len(by_part.get(part, ())) == 1
     }
 
 

@@ -1,8 +1,9 @@
 """Names of the parts of a floating body's pose and velocity, as logs write them."""
 
 import re
+from collections.abc import Collection
 
-__all__ = ["FRAMES", "pose_part"]
+__all__ = ["FRAMES", "pose_part", "pose_parts"]
 
 FRAMES = {
     "position": "in the world's frame",
@@ -44,3 +45,22 @@ def pose_part(name: str) -> tuple[str, str] | None:
         if found := re.fullmatch(pattern, word):
             return part, found.groups()[-1]
     return None
+
+
+def pose_parts(names: Collection[str]) -> dict[str, tuple[str, str]]:
+    """Returns the parts that a model's columns are, by name, with their axes.
+
+    ``hull_qw`` tells that the body ``hull`` floats, and that ``hull_x`` is its position, whatever
+    the body is called.
+
+    Args:
+        names: Names of the model's columns.
+    """
+    own = [re.sub("_qw$", "", name) for name in names if name.endswith("_qw")]
+    result = {}
+    for name in names:
+        short = next((name[len(body) :] for body in own if name.startswith(f"{body}_")), None)
+        part = pose_part(name if short is None else short.lstrip("_"))
+        if part is not None:
+            result[name] = part
+    return result

@@ -193,6 +193,14 @@ def test_the_parts_of_a_floating_bodys_pose_are_told_by_their_names(parts):
     assert [matches[f"thrust{number}"][0] for number in range(1, 5)] == names[-4:]
 
 
+def test_a_floating_body_may_have_any_name():
+    hull = [c._replace(name=c.name.replace("root", "hull")) for c in FLOATING]
+    names = ["x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "gyro_x"]
+    matches = found(hull, names)
+    assert [matches[f"hull_{axis}"][0] for axis in "xyz"] == names[:3]
+    assert matches["hull_y_velocity"][0] == "vy" and matches["hull_x_spin"][0] == "gyro_x"
+
+
 @pytest.mark.parametrize("motor", ["motor{}", "rotor_{}", "thrust[{}]", "esc_{}"])
 def test_commands_are_no_part_of_a_pose(motor):
     names = [f"q{axis}" for axis in "wxyz"]

@@ -15,6 +15,7 @@ __all__ = [
     "Joint",
     "JointElasticity",
     "JointLaw",
+    "JointPlace",
     "LoadDependentFriction",
     "PeriodicDisturbance",
     "PreslidingFriction",
@@ -50,16 +51,22 @@ class Joint:
     drive: float = 0.0
 
 
+JointPlace = str | int | tuple[str | int, int]
+"""Name or number of a hinge or slide; for a free joint or a ball, the same and the number
+of the degree of freedom: a free joint has forces along the body's own axes, then torques about
+them, and a ball has torques."""
+
+
 @dataclass
 class JointLaw:
     """A force at a joint, constant during an engine step.
 
     Attributes:
-        joint: Name or number of a hinge or slide.
+        joint: Where it acts.
         needs_dynamics: Whether it needs the joint's acceleration, inertia and drive.
     """
 
-    joint: str | int
+    joint: JointPlace
     needs_dynamics: ClassVar[bool] = False
 
     def reset(self, velocity: float) -> None:

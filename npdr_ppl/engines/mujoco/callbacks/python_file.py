@@ -153,7 +153,8 @@ def _law_lines(simulator: MujocoMechanism, effects: Sequence[Effect]) -> list[st
         if not is_traced:
             given += [f"{name}={value!r}," for name, value in effect.constants.items()]
         for place in _places(simulator, effect):
-            inside = "\n    ".join([f"{quoted(place)},", *given])
+            where = quoted(place) if not isinstance(place, tuple) else _pair(*place)
+            inside = "\n    ".join([f"{where},", *given])
             lines.append(f"{names[effect.name]}(\n    {inside}\n)")
     return lines
 
@@ -258,12 +259,20 @@ def _parameters(effect: Effect) -> list[tuple[Any, str]]:
     return list(zip(effect.parameters, effect.parameter_names, strict=True))
 
 
-def _places(simulator: MujocoMechanism, effect: Effect) -> list[str | int]:
-    """Returns the names of the joints, actuators or channels at which an effect acts."""
+def _pair(joint: str | int, number: int) -> str:
+    """Returns a joint and the number of its degree of freedom as Python."""
+    return f"({quoted(joint)}, {number})"
+
+
+def _places(simulator: MujocoMechanism, effect: Effect) -> list[joint_laws.JointPlace]:
+    """Returns the joints, actuators or channels at which an effect acts, by name."""
     model: Any = simulator.model
     if isinstance(effect, ForceEffect):
-        (joint,) = (p.joint for p in simulator.force_ports if p.port.name == effect.port)
-        return [model.joint(joint).name or joint]
+        (port,) = (p for p in simulator.force_ports if p.port.name == effect.port)
+        joint = model.joint(port.joint).name or port.joint
+        if port.position is None:
+            return [(joint, port.velocity - int(model.jnt_dofadr[port.joint]))]
+        return [joint]
     if isinstance(effect, SensorEffect):
         if simulator.port(effect.port).kind == "clock":
             return [sensor.name for sensor in simulator.sensors]

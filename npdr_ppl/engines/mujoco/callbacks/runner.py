@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from npdr_ppl.engines.mujoco.callbacks.command_laws import CommandLaw, ServoLaw
-from npdr_ppl.engines.mujoco.callbacks.joint_laws import Joint, JointLaw
+from npdr_ppl.engines.mujoco.callbacks.joint_laws import Joint, JointLaw, JointPlace
 from npdr_ppl.engines.mujoco.callbacks.sensor_laws import SensorLaw
 
 __all__ = ["Channel", "LawRunner"]
@@ -17,6 +17,47 @@ __all__ = ["Channel", "LawRunner"]
 Channel = tuple[str, str | int, int]
 """Where a measurement is: ``"qpos"`` and a joint, ``"qvel"`` and a joint, or ``"sensordata"`` and
 a sensor; then the number of the component in it."""
+
+
+class Axis:
+    """The degree of freedom of a joint on which a law acts.
+
+    Args:
+        model: The ``mujoco.MjModel``.
+        place: The joint, or the joint and the number of its degree of freedom.
+    """
+
+    def __init__(self, model: Any, place: JointPlace) -> None:
+        name, number = place if isinstance(place, tuple) else (place, None)
+        joint = model.joint(name)
+        first, self.place = int(joint.dofadr[0]), int(joint.qposadr[0])
+        is_free = int(joint.type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
+        # MuJoCo has the velocity of a free joint in the world's frame, its spin in the body's.
+        self.along = number if number is not None and is_free and number < 3 else None
+        self.is_floating = number is not None
+        self.dofs = (
+            [first, first + 1, first + 2] if self.along is not None else [first + (number or 0)]
+        )
+
+    def _direction(self, data: Any) -> Any:
+        """Returns the body's axis in the world's frame; 1 for other joints."""
+        if self.along is None:
+            return np.ones(1)
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, data.qpos[self.place + 3 : self.place + 7])
+        return matrix.reshape(3, 3)[:, self.along]
+
+    def position(self, data: Any) -> float:
+        """Returns the joint's position; NaN for a body that floats."""
+        return math.nan if self.is_floating else float(data.qpos[self.place])
+
+    def velocity(self, data: Any) -> float:
+        """Returns the velocity along the axis or about it."""
+        return float(self._direction(data) @ data.qvel[self.dofs])
+
+    def apply(self, data: Any, force: float) -> None:
+        """Adds a force along the axis or about it."""
+        data.qfrc_applied[self.dofs] += self._direction(data) * force
 
 
 class LawRunner:
@@ -38,9 +79,8 @@ class LawRunner:
         substeps: int,
     ) -> None:
         self.model, self.substeps = model, substeps
-        joints = [(law, model.joint(law.joint)) for law in laws if isinstance(law, JointLaw)]
-        self.forces = [(law, int(j.qposadr[0]), int(j.dofadr[0])) for law, j in joints]
-        self.dofs = sorted({dof for *_, dof in self.forces})
+        self.forces = [(law, Axis(model, law.joint)) for law in laws if isinstance(law, JointLaw)]
+        self.dofs = sorted({dof for _, axis in self.forces for dof in axis.dofs})
         self.commands = [
             (law, model.actuator(law.actuator).id) for law in laws if isinstance(law, CommandLaw)
         ]
@@ -58,7 +98,7 @@ class LawRunner:
             k for k, name in enumerate(bending) if name is not None and name in bending[:k]
         }
         self.inputs: dict[int, tuple[float, float]] = {}
-        self.needs_dynamics = any(law.needs_dynamics for law, *_ in self.forces)
+        self.needs_dynamics = any(law.needs_dynamics for law, _ in self.forces)
         self.friction = model.dof_frictionloss
         low, high = model.actuator_ctrlrange.T
         self.low = np.where(model.actuator_ctrllimited, low, -np.inf)
@@ -81,8 +121,8 @@ class LawRunner:
         self.is_started = False
         self.before = None if commands_before is None else np.array(commands_before, dtype=float)
         data.qfrc_applied[self.dofs] = 0.0
-        for law, _, dof in self.forces:
-            law.reset(float(data.qvel[dof]))
+        for law, axis in self.forces:
+            law.reset(axis.velocity(data))
         for law, _ in self.servos:
             law.reset()
         values = self._true_values(data)
@@ -185,17 +225,17 @@ class LawRunner:
             # RK4 follows the error within the step; all other integrators hold the servo's force.
             change = means[i] - mean if self.is_fourth else acted - error
             data.ctrl[i] += change
-        h, qpos, qvel, applied = model.opt.timestep, data.qpos, data.qvel, data.qfrc_applied
-        middle = data.time + 0.5 * h
-        joints = [Joint(float(qpos[q]), float(qvel[v]), middle, h) for _, q, v in self.forces]
+        h, middle = model.opt.timestep, data.time + 0.5 * model.opt.timestep
+        joints = [
+            Joint(axis.position(data), axis.velocity(data), middle, h) for _, axis in self.forces
+        ]
         if self.needs_dynamics:
             self._add_dynamics(joints, data)
         own_friction = [(dof, self.friction[dof]) for dof in self.dofs]
-        for dof in self.dofs:
-            applied[dof] = 0.0
-        for (law, _, dof), joint in zip(self.forces, joints, strict=True):
-            applied[dof] += law.applied_force(joint)
-            self.friction[dof] += law.dry_friction(joint)
+        data.qfrc_applied[self.dofs] = 0.0
+        for (law, axis), joint in zip(self.forces, joints, strict=True):
+            axis.apply(data, law.applied_force(joint))
+            self.friction[axis.dofs] += law.dry_friction(joint)
             law.finish(joint)
         mujoco.mj_step(model, data)
         for dof, bound in own_friction:
@@ -205,14 +245,15 @@ class LawRunner:
         """Gives the joints what laws need that solve for their own force, and advances them."""
         model = self.model
         data.qfrc_applied[self.dofs] = 0.0
-        for (law, _, dof), joint in zip(self.forces, joints, strict=True):
+        for (law, axis), joint in zip(self.forces, joints, strict=True):
             if not law.needs_dynamics:
-                data.qfrc_applied[dof] += law.applied_force(joint)
+                axis.apply(data, law.applied_force(joint))
         guess = data.qacc_warmstart.copy()
         mujoco.mj_forward(model, data)
         data.qacc_warmstart[:] = guess
-        for (law, _, dof), joint in zip(self.forces, joints, strict=True):
+        for (law, axis), joint in zip(self.forces, joints, strict=True):
             if law.needs_dynamics:
+                (dof,) = axis.dofs
                 unit, reached = np.zeros((1, model.nv)), np.zeros((1, model.nv))
                 unit[0, dof] = 1.0
                 mujoco.mj_solveM(model, data, reached, unit)
