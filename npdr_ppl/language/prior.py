@@ -19,6 +19,7 @@ from torch.distributions import Independent, Uniform, constraints
 
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.handlers import SkipSimulation
+from npdr_ppl.language.independent_sites import IndependentSites
 from npdr_ppl.language.latent_sites import (
     Batch,
     CheckSupport,
@@ -39,6 +40,9 @@ from npdr_ppl.language.reference import reference_map
 from npdr_ppl.language.sites import BlackBox
 
 __all__ = ["LatentSite", "Prior"]
+
+_NUM_CHECKED = 16
+"""Random points at which sites are checked for their dependence on each other."""
 
 
 class Prior:
@@ -158,6 +162,17 @@ class Prior:
                     "black-box site; declare it with npdr.simulate, or use NUTS."
                 )
 
+    @cached_property
+    def _independent(self) -> IndependentSites | None:
+        """The sites if :class:`IndependentSites` can stand for their program, else ``None``."""
+        if not self.is_standard_normal:
+            return None
+        generator = torch.Generator().manual_seed(0)
+        z = torch.randn(_NUM_CHECKED, self.num_parameters, generator=generator).double()
+        return IndependentSites.of(
+            self.sites, self.distributions, self._run(WriteCoordinates(self.sites, z))
+        )
+
     def sample(self, num_samples: int) -> Tensor:
         """Draws z from the prior, ``(num_samples, d)`` float64, from torch's global stream."""
         if self.is_standard_normal:
@@ -193,6 +208,8 @@ class Prior:
 
     def to_parameters(self, z: Tensor) -> dict[str, Tensor]:
         """Maps z, ``(n, d)``, to values of every latent site, ``(n,) + site.shape``."""
+        if self._independent is not None:
+            return self._independent.to_parameters(z)
         trace = self._run(WriteCoordinates(self.sites, z))
         return {
             site.name: self._without_padding(site, trace.nodes[site.name]["value"])
@@ -201,6 +218,8 @@ class Prior:
 
     def to_reference(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Maps values of every latent site, ``(n,) + site.shape``, to z; differentiable."""
+        if self._independent is not None:
+            return self._independent.to_reference(parameters)
         num = next(iter(parameters.values())).shape[0]
         data = self._padded(parameters)
         messenger = ReadCoordinates(self.sites)
@@ -218,6 +237,8 @@ class Prior:
         Returns:
             Mask ``(n,)``; NaN and infinity are off every support.
         """
+        if self._independent is not None:
+            return self._independent.on_support(parameters)
         num = next(iter(parameters.values())).shape[0]
         checker = CheckSupport(self._padded(parameters), num)
         with alone(), SkipSimulation(), checker, Batch(self.max_plate_nesting, num):
@@ -226,6 +247,8 @@ class Prior:
 
     def log_prob_parameters(self, z: Tensor) -> Tensor:
         """Returns the prior's log density over the parameters at z, ``(n,)``."""
+        if self._independent is not None:
+            return self._independent.log_prob_parameters(z)
         trace = self._run(WriteCoordinates(self.sites, z))
         total = torch.zeros(z.shape[0], dtype=torch.float64)
         for site in self.sites:
