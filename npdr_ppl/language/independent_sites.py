@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.language.latent_sites import LatentSite
+from npdr_ppl.language.program_runs import unvalidated
 from npdr_ppl.language.reference import reference_map
 
 __all__ = ["IndependentSites"]
@@ -55,6 +56,7 @@ class IndependentSites:
                 return None
         return found
 
+    @unvalidated()
     def to_parameters(self, z: Tensor) -> dict[str, Tensor]:
         """Maps z, ``(n, d)``, to values of every site, ``(n,)`` each."""
         z = z.double()
@@ -63,6 +65,7 @@ class IndependentSites:
             for k, (site, to_value) in enumerate(zip(self.sites, self.maps, strict=True))
         }
 
+    @unvalidated()
     def to_reference(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Maps values of every site, ``(n,)`` each, to z, ``(n, d)``."""
         columns = [
@@ -71,6 +74,7 @@ class IndependentSites:
         ]
         return torch.stack(columns, dim=-1)
 
+    @unvalidated()
     def on_support(self, parameters: Mapping[str, Tensor]) -> Tensor:
         """Returns which values, ``(n,)`` each, all are on their supports, ``(n,)``."""
         inside = torch.tensor(True)
@@ -79,6 +83,7 @@ class IndependentSites:
             inside = inside & distribution.support.check(value) & value.isfinite()
         return inside
 
+    @unvalidated()
     def log_prob_parameters(self, z: Tensor) -> Tensor:
         """Returns the log density over the parameters at z, ``(n,)``."""
         values = self.to_parameters(z)

@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 from npdr_ppl.errors import ModelError, NpdrError
 from npdr_ppl.language.model import Model
 
-__all__ = ["BATCH_PLATE", "alone", "sample_sites", "traced"]
+__all__ = ["BATCH_PLATE", "alone", "sample_sites", "traced", "unvalidated"]
 
 BATCH_PLATE = "_npdr_batch"
 """Name of the plate to the left of a program's plates; it evaluates all points in one run."""
@@ -26,7 +26,14 @@ ALL_POINTS = (
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Hides a run of the program from outer handlers and switches off validation.
+    """Hides a run of the program from outer handlers and switches off validation."""
+    with unvalidated(), poutine.block():
+        yield
+
+
+@contextmanager
+def unvalidated() -> Iterator[None]:
+    """Switches off the validation of distributions' arguments and values.
 
     Values are not validated, because some are deliberately off their support, and a NaN from one
     simulation must not affect the others. Pyro's own switch is not enough, because other libraries
@@ -35,8 +42,7 @@ def alone() -> Iterator[None]:
     is_validating = Distribution._validate_args
     Distribution.set_default_validate_args(False)
     try:
-        with poutine.block():
-            yield
+        yield
     finally:
         Distribution.set_default_validate_args(is_validating)
 

@@ -98,6 +98,12 @@ def test_the_support_is_that_of_the_program(both):
     assert own.tolist() == wanted.tolist() == [False] * 4 + [True] * 2
 
 
+def test_values_are_not_validated(both):
+    """Off the support, densities are −∞ or NaN, and no error."""
+    own, wanted = both(smooth, lambda prior: prior.log_prob_parameters(torch.full((2, 3), 1e3)))
+    assert own.tolist() == wanted.tolist()
+
+
 def test_coordinates_can_be_differentiated(both):
     def slope(prior):
         z = points(prior, 3).requires_grad_()

@@ -81,7 +81,10 @@ def sound_alarm(
     chance = LargestStatistic(projection, seed=seed)
     ports = {name: PulseChanges(projection, change) for name, change in found.by_port.items()}
     generic = generic_laws(found, ports, sensors) + reading_laws(projection)
-    listed = wave_laws(found, ports) + ripple_laws(found, ports, sensors)
+    simulator = projection.hypothesis.simulator
+    # A body that floats has nothing that repeats with its position.
+    bearings = {name: p for name, p in ports.items() if not simulator.port(name).is_floating}
+    listed = wave_laws(found, ports) + ripple_laws(found, bearings, sensors)
     # Each kind is tested separately, so that many implausible laws do not hide an effect of the
     # catalogue.
     values: dict[str, float] = {}
