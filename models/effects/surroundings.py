@@ -131,6 +131,8 @@ class Contact(EnvironmentEffect):
     """
 
     id = "contact"
+    # A foot sticks or slips, so that small changes of friction may change nothing.
+    is_smooth = False
     parameters = (
         Parameter("friction", "1", 0.0, "logarithmic change of sliding friction"),
         Parameter("restitution", "1", 0.0, "logarithmic change of restitution"),

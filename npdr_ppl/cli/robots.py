@@ -74,9 +74,11 @@ def _expected_time(path: Path, robot: "MujocoSimulator") -> dict[str, float | No
 
     sensors = {sensor.name for sensor in robot.sensors}
     pose = {
-        state.name: float(robot.initial_positions[component.address])
+        state.name: 0.0
+        if component.is_velocity
+        else float(robot.initial_positions[component.address])
         for component, state in zip(robot.components, robot.states, strict=True)
-        if not component.is_velocity and state.name in sensors
+        if state.rate_of is None and state.name in sensors
     }
     try:
         seconds = seconds_to_fit(resolve_model(str(path)), pose, recorded=RECORDED)

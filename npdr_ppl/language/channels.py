@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from npdr_ppl.errors import ModelError
 
-__all__ = ["Channel", "Follower", "Parameter", "Port", "PortKind"]
+__all__ = ["Channel", "Follower", "Parameter", "Port", "PortKind", "Spin"]
 
 PortKind = Literal["force", "action", "servo", "sensor", "environment", "clock", "parameter"]
 
@@ -42,11 +45,74 @@ class Follower:
         name: The state that follows.
         leader: The state it follows from.
         coefficients: Coefficients of the polynomial of the leader that it is, the constant first.
+        unit: Its unit; that of the leader if empty.
     """
 
     name: str
     leader: str
     coefficients: tuple[float, ...]
+    unit: str = ""
+
+    @property
+    def leaders(self) -> tuple[str, ...]:
+        """All states that it follows from."""
+        return (self.leader,)
+
+    def follow(self, values: NDArray[np.float64], time_step: float) -> NDArray[np.float64]:
+        """Returns its values, ``(T,)``.
+
+        Args:
+            values: Values of the leaders, ``(T, 1)``.
+            time_step: Seconds between them.
+        """
+        return np.polynomial.Polynomial(self.coefficients)(values[:, 0])
+
+
+@dataclass(frozen=True)
+class Spin:
+    """An angular velocity about an axis of a floating body, which follows from its orientation.
+
+    Attributes:
+        name: The state that follows.
+        axis: Number of the body's axis.
+        leaders: The states w, x, y and z of the quaternion from the body's frame to the world's.
+        unit: Its unit.
+    """
+
+    name: str
+    axis: int
+    leaders: tuple[str, str, str, str]
+    unit: str = "rad/s"
+
+    @property
+    def leader(self) -> str:
+        """The first state that it follows from."""
+        return self.leaders[0]
+
+    def follow(self, values: NDArray[np.float64], time_step: float) -> NDArray[np.float64]:
+        """Returns the angular velocity between the samples before and after each, ``(T,)``.
+
+        Args:
+            values: The quaternions, ``(T, 4)``, each with either sign.
+            time_step: Seconds between them.
+        """
+        places = np.arange(len(values))
+        before, after = np.maximum(places - 1, 0), np.minimum(places + 1, len(values) - 1)
+        one, other = values[before], values[after]
+        # The turn from one to the other in the body's frame, conj(one) other.
+        w = (one * other).sum(1)
+        turn = (
+            one[:, :1] * other[:, 1:]
+            - other[:, :1] * one[:, 1:]
+            - np.cross(one[:, 1:], other[:, 1:])
+        )
+        size = np.linalg.norm(turn, axis=1)
+        turn *= np.sign(w)[:, None]
+        angle = 2.0 * np.arctan2(size, np.abs(w))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(size > 0.0, turn[:, self.axis] / size, 0.0)
+        share = np.where(np.isnan(size), np.nan, share)
+        return angle * share / (time_step * np.maximum(after - before, 1))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
-from npdr_ppl.language.channels import Channel, Follower, Parameter, Port, find_port
+from npdr_ppl.language.channels import Channel, Follower, Parameter, Port, Spin, find_port
 from npdr_ppl.language.effects import ComplianceEffect, Effect, ParameterEffect, ServoEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import InverseDynamics
@@ -172,8 +172,8 @@ class Simulator(ABC):
         return tuple(state.rate_of is not None for state in self.states)
 
     @property
-    def followers(self) -> tuple[Follower, ...]:
-        """Positions that need not be recorded, because they follow from others."""
+    def followers(self) -> tuple[Follower | Spin, ...]:
+        """States that need not be recorded, because they follow from others."""
         return ()
 
     @property

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from npdr_ppl.language.channels import Follower
 from npdr_ppl.language.effects import SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
@@ -205,7 +206,7 @@ def _followers(
         values: Values of the channels, ``(n, channels)``.
     """
     names = rollouts.channel_names
-    for follower in simulator.followers:
+    for follower in (f for f in simulator.followers if isinstance(f, Follower)):
         is_there = follower.name in names and follower.leader in rollouts.measured_names
         if is_there and follower.name not in rollouts.measured_names:
             leader = names.index(follower.leader)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from npdr_ppl.errors import DataError
-from npdr_ppl.language.channels import Channel, Follower
+from npdr_ppl.language.channels import Channel, Follower, Spin
 from npdr_ppl.rollouts import segments
 from npdr_ppl.rollouts.arrays import Array
 from npdr_ppl.rollouts.recording import Recording
@@ -152,37 +152,43 @@ def with_commands(rollouts: Episodes, actions: Sequence[Channel]) -> Episodes:
     )
 
 
-def with_followers(rollouts: Episodes, followers: Sequence[Follower]) -> Episodes:
-    """Returns rollouts with the positions that follow from recorded ones, not as measurements.
+def with_followers(rollouts: Episodes, followers: Sequence[Follower | Spin]) -> Episodes:
+    """Returns rollouts with the states that follow from recorded ones, not as measurements.
 
     They say where a simulation begins, but it is not compared with them.
 
     Args:
         rollouts: The rollouts.
-        followers: Positions that follow from others.
+        followers: States that follow from others.
     """
     while True:
         names = rollouts.channel_names
-        new = [f for f in followers if f.name not in names and f.leader in names]
+        new = [f for f in followers if f.name not in names and set(f.leaders) <= set(names)]
         if not new:
             return rollouts
         follower = new[0]
-        column = names.index(follower.leader)
-        curve = np.polynomial.Polynomial(follower.coefficients)
-        values = [curve(readings[:, [column]]) for readings in rollouts.readings]
+        columns = [names.index(leader) for leader in follower.leaders]
+        values = [
+            follower.follow(readings[:, columns], rollouts.time_step)[:, None]
+            for readings in rollouts.readings
+        ]
         samplings = rollouts.samplings or [Sampling.at_rows(r) for r in rollouts.readings]
         rollouts = replace(
             rollouts,
             readings=tuple(map(np.hstack, zip(rollouts.readings, values, strict=True))),
             channel_names=(*names, follower.name),
-            channel_units=(*rollouts.channel_units, rollouts.channel_units[column]),
+            channel_units=(
+                *rollouts.channel_units,
+                follower.unit or rollouts.channel_units[columns[0]],
+            ),
             samplings=tuple(
                 sampling.with_unread(added)
                 for sampling, added in zip(samplings, values, strict=True)
             ),
             notes=(
                 *rollouts.notes,
-                f"{follower.name} was not recorded: it follows from {follower.leader}.",
+                f"{follower.name} was not recorded: it follows from "
+                f"{', '.join(follower.leaders)}.",
             ),
         )
 

@@ -9,6 +9,7 @@ from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag, ViscousFriction, effects
+from npdr_ppl.rollouts.collection import with_followers
 from tests.helpers.command_line import run
 from tests.helpers.exported_robots import difference
 
@@ -71,11 +72,46 @@ def test_slides_and_a_ball_joint_move_as_a_free_joint_and_have_its_columns(tmp_p
     assert free.joints == slides.joints == PORTS
 
 
+def test_spins_follow_from_a_quaternion_of_either_sign(tmp_path):
+    free = robot(tmp_path, FREE, "free.xml")
+    own, names = flown(free)
+    columns = [names.index(f"root_q{axis}") for axis in "wxyz"]
+    quaternions = own.numpy()[:, columns]
+    quaternions[::3] *= -1.0
+    for spin in free.followers:
+        wanted = own[:, names.index(spin.name)].numpy()
+        assert np.abs(wanted).max() > 1.0
+        found = spin.follow(quaternions, 0.01)
+        # The engine advances orientations with the spins at the end of its steps of 2 ms.
+        assert found[1:-1] == pytest.approx(wanted[1:-1], rel=0.06)
+    quaternions[5] = np.nan
+    assert np.isnan(spin.follow(quaternions, 0.01)[[4, 6]]).all()
+
+
+def test_spins_may_be_left_out_of_a_recording(tmp_path):
+    free = robot(tmp_path, FREE, "free.xml")
+    own, names = flown(free)
+    recorded = [n for n in names if not n.endswith("_spin")]
+    rollouts = npdr.Rollouts.from_arrays(
+        readings=[own[:, [names.index(n) for n in recorded]].numpy()],
+        actions=[np.zeros((99, 1))],
+        channel_names=recorded,
+        action_names=["thrust"],
+        time_step=0.01,
+    )
+    whole = with_followers(rollouts, free.followers)
+    assert set(whole.channel_names) == set(names)
+    assert set(whole.measured_names) == set(recorded)
+    assert "root_x_spin was not recorded: it follows from root_qw, root_qx" in str(whole.notes)
+    whole.check(free.sensors, free.actions)
+
+
 def test_inspect_tells_frames_and_ports(tmp_path, monkeypatch, capsys):
     robot(tmp_path, FREE, "free.xml")
     code, out, _ = run(monkeypatch, capsys, "inspect", tmp_path / "free.xml")
     assert code == 0
-    assert "rad/s  about the body's own axes" in out
+    assert "rad/s  may be left out; about the body's own axes" in out
+    assert "closest fit" in out
     assert "force on a floating body, along and about its own axes: root_x_force [N]" in out
 
 

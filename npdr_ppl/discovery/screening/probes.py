@@ -70,7 +70,11 @@ def probe_of(
     shapes = [(shape, False) for shape in _shapes(effect, priors, strengths)]
     if hint:
         shapes.append(({**shapes[0][0], **hint}, True))
-    sizes = SENSITIVITY.sizes if needs_size(effect, strengths) else (SENSITIVITY.smooth_size,)
+    sizes: tuple[float, ...] = (SENSITIVITY.smooth_size,)
+    if needs_size(effect, strengths):
+        sizes = SENSITIVITY.sizes
+        if all(_may_be_negative(priors[n], resting[n]) for n in strengths):
+            sizes = *sizes, *(-size for size in sizes)
     if effect.is_resonant:
         shapes, sizes = shapes[:1], SENSITIVITY.resonant_sizes
     limits = [n for n in strengths if math.isinf(resting[n]) and n not in peaks]
@@ -93,6 +97,12 @@ def probe_of(
         for k, on in enumerate(strengths)
     ]
     return Probe(effect, priors, cases, strengths, nominal, runs)
+
+
+def _may_be_negative(prior: Distribution, zero: float) -> bool:
+    """Returns whether a strength can be on either side of zero strength."""
+    lower = getattr(prior.support, "lower_bound", -math.inf)
+    return math.isfinite(zero) and float(lower) < zero
 
 
 def _switched_on(

@@ -13,7 +13,7 @@ from npdr_ppl.engines.mujoco.fields import (
     joint_units,
 )
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.channels import Channel
+from npdr_ppl.language.channels import Channel, Spin
 from npdr_ppl.registry import hint
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "action_channels",
     "choose",
     "mjcf_sensors",
+    "spins",
     "state_components",
 ]
 
@@ -93,6 +94,38 @@ def state_components(model: Any) -> tuple[Component, ...]:
             for i, (n, unit, rate_of) in enumerate(velocities)
         ),
     )
+
+
+def spins(
+    model: Any, components: Sequence[Component], states: Sequence[Channel]
+) -> tuple[Spin, ...]:
+    """Returns the states that are spins of balls and free bodies whose orientation is a state.
+
+    Args:
+        model: A ``mujoco.MjModel``.
+        components: Where MuJoCo stores each state.
+        states: The states.
+    """
+    mujoco: Any = importlib.import_module("mujoco")
+    names = {
+        (component.is_velocity, component.address): state.name
+        for component, state in zip(components, states, strict=True)
+    }
+    result = []
+    for joint in range(model.njnt):
+        is_free = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE)
+        if not is_free and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_BALL):
+            continue
+        place, rate = (
+            int(first[joint]) + (3 if is_free else 0)
+            for first in (model.jnt_qposadr, model.jnt_dofadr)
+        )
+        w, x, y, z = (names.get((False, place + k)) for k in range(4))
+        for axis in range(3):
+            name = names.get((True, rate + axis))
+            if name and w and x and y and z:
+                result.append(Spin(name, axis, (w, x, y, z)))
+    return tuple(result)
 
 
 def mjcf_sensors(model: Any) -> tuple[Reading, ...]:

@@ -27,6 +27,7 @@ from npdr_ppl.engines.mujoco.channels import (
     action_channels,
     choose,
     mjcf_sensors,
+    spins,
     state_components,
 )
 from npdr_ppl.engines.mujoco.coupled_joints import coupled_joints
@@ -42,7 +43,7 @@ from npdr_ppl.engines.mujoco.second_joints import (
 )
 from npdr_ppl.engines.mujoco.servos import check_servo, with_servos
 from npdr_ppl.errors import ModelError
-from npdr_ppl.language.channels import Channel, Follower
+from npdr_ppl.language.channels import Channel, Follower, Spin
 from npdr_ppl.language.effects import (
     ComplianceEffect,
     Effect,
@@ -174,9 +175,10 @@ class MujocoMechanism(ClosedLoopSimulator):
         }
 
     @property
-    def followers(self) -> tuple[Follower, ...]:
-        """States of joints that equality constraints tie to others."""
-        return coupled_joints(self.model, self.components, self.states)
+    def followers(self) -> tuple[Follower | Spin, ...]:
+        """States of joints that equality constraints tie to others, and spins."""
+        tied = coupled_joints(self.model, self.components, self.states)
+        return *tied, *spins(self.model, self.components, self.states)
 
     def recorded_settings(self) -> dict[str, Any]:
         """Returns the MJCF's text, the fields that parameters set, and the engine's version."""

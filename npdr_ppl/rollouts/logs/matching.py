@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Container, Sequence
 from typing import NamedTuple
 
-from npdr_ppl.language.channels import Channel, Follower
+from npdr_ppl.language.channels import Channel, Follower, Spin
 from npdr_ppl.rollouts.logs.inspection import SignalSummary
 from npdr_ppl.rollouts.logs.pose_names import FRAMES, pose_part, pose_parts
 from npdr_ppl.rollouts.logs.signal_names import Role, role_of
@@ -57,7 +57,9 @@ class Match(NamedTuple):
 
 
 def columns_of(
-    sensors: Sequence[Channel], actions: Sequence[Channel], followers: Sequence[Follower] = ()
+    sensors: Sequence[Channel],
+    actions: Sequence[Channel],
+    followers: Sequence[Follower | Spin] = (),
 ) -> list[Column]:
     """Returns the columns that a model reads: those of its sensors, then those of its actions.
 
