@@ -36,6 +36,7 @@ from npdr_ppl.discovery.settings import VERDICT
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.model import Model
 from npdr_ppl.preparation.data_options import DataOptions
+from npdr_ppl.preparation.jumps import jumps_of
 from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.progress import Reporter, reporter
 from npdr_ppl.rollouts import Rollouts
@@ -313,7 +314,7 @@ class Investigation:
             start=hypothesis.parameters,
         )
 
-    @property
+    @cached_property
     def preparation(self) -> PreparationSummary:
         """What was done to the recording, and with it to the model, before the search."""
         likelihood = self.start.likelihood
@@ -326,6 +327,7 @@ class Investigation:
             self._searcher.are_steps_coarse,
             likelihood.share,
             tuple(map(str, self.narrow_priors)),
+            str(jumps_of(likelihood)),
         )
 
     def _conclusion(self) -> Conclusion:

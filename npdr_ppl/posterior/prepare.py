@@ -8,6 +8,7 @@ features. ``discover`` shares its first part, the fit in ``discovery/search/orig
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -30,6 +31,7 @@ from npdr_ppl.preparation.binding import BoundModel, bind
 from npdr_ppl.preparation.closest_fit import ClosestFit, closest_fit
 from npdr_ppl.preparation.data_options import FEWEST_SEGMENTS, PLAIN_FEATURES, DataOptions
 from npdr_ppl.preparation.initial_states import InitialStates
+from npdr_ppl.preparation.jumps import jumps_of
 from npdr_ppl.preparation.preparation_summary import PreparationSummary
 from npdr_ppl.preparation.segment_fit import SegmentFit, fit_segments
 from npdr_ppl.preparation.segment_likelihood import SegmentLikelihood
@@ -167,7 +169,12 @@ class Preparation:
             self.are_steps_coarse,
             None if self.likelihood is None else self.likelihood.share,
             tuple(map(str, self.ends)),
+            self._jumps,
         )
+
+    @cached_property
+    def _jumps(self) -> str:
+        return "" if self.likelihood is None else str(jumps_of(self.likelihood))
 
 
 def prepare(

@@ -23,6 +23,7 @@ class PreparationSummary:
         independent_share: Effective number of independent measurements, as a share of all;
             ``None`` if it was not estimated.
         narrow_priors: The priors that end too early, a sentence each.
+        jumps: A sentence about jumps of the simulation; empty if they do not matter.
     """
 
     rollouts: Rollouts
@@ -31,6 +32,7 @@ class PreparationSummary:
     are_steps_coarse: bool
     independent_share: float | None
     narrow_priors: tuple[str, ...] = ()
+    jumps: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Returns JSON-serialisable values, the sentence included."""
@@ -51,10 +53,11 @@ class PreparationSummary:
             "steps": "refined" if self.are_steps_coarse else "as the model has them",
             "independent_share": self.independent_share,
             "priors_too_narrow": list(self.narrow_priors),
+            "jumps": self.jumps,
         }
 
     def sentence(self) -> str:
-        """Returns a line that says how the recording was prepared."""
+        """Returns a line that says how the recording was prepared, and what to beware of."""
         length = self.options.steps(self.rollouts)
         cut = (
             "whole rollouts"
@@ -76,4 +79,5 @@ class PreparationSummary:
         steps = ", integration steps refined" if self.are_steps_coarse else ""
         held = self.options.commands_before == "first"
         before = ", first commands held before each rollout" if held else ""
-        return f"Prepared: {cut}, {starts}, {noise}{before}{steps}."
+        jumps = f" {self.jumps}" if self.jumps else ""
+        return f"Prepared: {cut}, {starts}, {noise}{before}{steps}.{jumps}"

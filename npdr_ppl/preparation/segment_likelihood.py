@@ -127,13 +127,18 @@ class SegmentLikelihood:
 
         q = (w/v)^½ C^−½ r in float64 at points ``(n, d)``; not finite where a simulation fails.
         """
-        left, sizes, _ = torch.linalg.svd(self.linearisation.by_starts, full_matrices=False)
-        shrunk = (1.0 + sizes.square()).rsqrt() - 1.0
+        left, shrunk = self._shrinkage
         found = []
         for residual in self._residuals(z):
             towards = shrunk * torch.einsum("snm,bsn->bsm", left, residual)
             found.append((residual + torch.einsum("snm,bsm->bsn", left, towards)).flatten(1))
         return math.sqrt(self.share / self.variance) * torch.cat(found)
+
+    @cached_property
+    def _shrinkage(self) -> tuple[Tensor, Tensor]:
+        """Directions U of C^−½, ``(S, N, m)``, and what is added along them, ``(S, m)``."""
+        left, sizes, _ = torch.linalg.svd(self.linearisation.by_starts, full_matrices=False)
+        return left, (1.0 + sizes.square()).rsqrt() - 1.0
 
     def information(self) -> Tensor:
         """Returns the Fisher information of the parameters at the closest fit, ``(d, d)``."""
