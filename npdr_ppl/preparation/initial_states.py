@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npdr_ppl.language.channels import Follower
+from npdr_ppl.language.channels import Follower, Spin
 from npdr_ppl.language.effects import SensorEffect
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.simulator import Simulator
@@ -33,6 +33,7 @@ __all__ = [
     "error_factors",
     "estimate_starts",
     "uncertain_components",
+    "with_spins",
 ]
 
 
@@ -106,6 +107,43 @@ class InitialStates:
             initial_value_errors=self.value_errors,
             initial_rate_errors=self.rate_errors,
         )
+
+
+_OF_RATES = (
+    ((1, -1.0), (0, 1.0), (3, 1.0), (2, -1.0)),
+    ((2, -1.0), (3, -1.0), (0, 1.0), (1, 1.0)),
+    ((3, -1.0), (2, 1.0), (1, -1.0), (0, 1.0)),
+)
+"""Half a spin is the imaginary part of q* q̇. For each axis: the part of q = (w, x, y, z) by which
+each part of q̇ is multiplied, and its sign."""
+
+
+def with_spins(states: InitialStates, simulator: Simulator, rollouts: Rollouts) -> InitialStates:
+    """Returns initial states whose spins follow from the orientations, if they were not measured.
+
+    Args:
+        states: The initial states.
+        simulator: The simulator.
+        rollouts: The recording.
+    """
+    names, measured = rollouts.channel_names, rollouts.measured_names
+    spins = [
+        f
+        for f in simulator.followers
+        if isinstance(f, Spin) and {f.name, *f.leaders} <= set(names) and f.name not in measured
+    ]
+    if not spins:
+        return states
+    values, errors = states.values.clone(), states.value_errors.clone()
+    rate_errors = states.rate_errors.clone()
+    for spin in spins:
+        columns, own = [names.index(leader) for leader in spin.leaders], names.index(spin.name)
+        quaternion = values[:, columns]
+        signed = torch.stack([s * quaternion[:, k] for k, s in _OF_RATES[spin.axis]], dim=-1)
+        values[:, own] = 2.0 * (signed * states.rates[:, columns]).sum(-1)
+        errors[:, own] = 2.0 * (signed * rate_errors[:, columns]).square().sum(-1).sqrt()
+        rate_errors[:, own] = 0.0
+    return replace(states, values=values, value_errors=errors, rate_errors=rate_errors)
 
 
 def uncertain_components(inputs: Inputs) -> list[tuple[str, int, Tensor]]:
@@ -187,6 +225,7 @@ def estimate_starts(
             shift[:, this], rate[:, this] = slope * shift[:, leader], slope * rate[:, leader]
             error[:, this] = rate_error[:, this] = 0.0
         new = InitialStates(values[own] + shift, rates[own] + rate, error, rate_error)
+        new = with_spins(new, box.simulator, rollouts)
         is_better = is_reported & (new.values + new.rates).isfinite()
         found = found.replaced(own, new, is_better)
     return found

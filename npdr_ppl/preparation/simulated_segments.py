@@ -25,7 +25,11 @@ from npdr_ppl.language.sites import SimulatorBlackBox
 from npdr_ppl.preparation.commands_before import began_in_operation
 from npdr_ppl.preparation.data_options import MAX_READINGS_PER_CHUNK, DataOptions
 from npdr_ppl.preparation.effective_share import effective_share
-from npdr_ppl.preparation.initial_states import InitialStates, uncertain_components
+from npdr_ppl.preparation.initial_states import (
+    InitialStates,
+    uncertain_components,
+    with_spins,
+)
 from npdr_ppl.preparation.settings import LINEARISATION
 from npdr_ppl.rollouts import Rollouts
 
@@ -188,7 +192,11 @@ class SimulatedSegments:
             self.observed = rollouts.observation(self._cut, channels=self.channel_names)
             self.__dict__.pop("least_scale", None)
             self.__dict__.pop("num_measured", None)
-        self._smoothed = _with_lagging_rates(self._cut, rollouts, box.simulator.rate_lag)
+        smoothed = _with_lagging_rates(self._cut, rollouts, box.simulator.rate_lag)
+        states = InitialStates.of(smoothed)
+        if states is not None:
+            smoothed = with_spins(states, box.simulator, rollouts).put_into(smoothed)
+        self._smoothed = smoothed
 
     def _start_from(self, starts: InitialStates | None) -> None:
         self.starts = starts
