@@ -64,7 +64,7 @@ class Cogging(LinearForceEffect):
 
     def suits(self, port: Port) -> bool:
         """Returns whether the joint turns."""
-        return super().suits(port) and port.coordinate == "rad"
+        return port.coordinate == "rad"
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any
@@ -156,7 +156,7 @@ class Wind(ForceEffect):
 
     def suits(self, port: Port) -> bool:
         """Returns whether the joint turns; on a sliding joint, wind is a bias and drag."""
-        return super().suits(port) and port.coordinate == "rad"
+        return port.coordinate == "rad"
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any

@@ -132,7 +132,7 @@ class Unbalance(LinearForceEffect):
 
     def suits(self, port: Port) -> bool:
         """Returns whether the joint turns."""
-        return super().suits(port) and port.coordinate == "rad"
+        return port.coordinate == "rad"
 
     def force(
         self, position: Tensor, velocity: Tensor, parameters: Mapping[str, Tensor], memory: Any

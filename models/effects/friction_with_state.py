@@ -121,7 +121,7 @@ class LoadDependentFriction(ForceEffect):
 
     def suits(self, port: Port) -> bool:
         """Returns whether a drive acts on the joint."""
-        return super().suits(port) and port.is_driven
+        return port.is_driven
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Tensor:
         """Returns a load of zero."""

@@ -53,7 +53,7 @@ class _Transmission(ForceEffect):
 
     def suits(self, port: Port) -> bool:
         """Returns whether a motor drives the joint."""
-        return super().suits(port) and port.is_driven
+        return port.is_driven
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> _Memory:
         """Returns an unknown advance, NaN."""

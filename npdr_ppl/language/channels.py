@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,13 +45,13 @@ class Follower:
         name: The state that follows.
         leader: The state it follows from.
         coefficients: Coefficients of the polynomial of the leader that it is, the constant first.
-        unit: Its unit; that of the leader if empty.
+        unit: Empty: it is that of the leader.
     """
 
+    unit: ClassVar[str] = ""
     name: str
     leader: str
     coefficients: tuple[float, ...]
-    unit: str = ""
 
     @property
     def leaders(self) -> tuple[str, ...]:
@@ -79,10 +79,10 @@ class Spin:
         unit: Its unit.
     """
 
+    unit: ClassVar[str] = "rad/s"
     name: str
     axis: int
     leaders: tuple[str, str, str, str]
-    unit: str = "rad/s"
 
     @property
     def leader(self) -> str:

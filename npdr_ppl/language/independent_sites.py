@@ -31,6 +31,7 @@ class IndependentSites:
         self.maps = [reference_map(distribution) for distribution in self.distributions]
 
     @classmethod
+    @unvalidated()
     def of(
         cls, sites: Sequence[LatentSite], distributions: Mapping[str, Any], trace: Any
     ) -> "IndependentSites | None":
@@ -72,7 +73,7 @@ class IndependentSites:
             to_value.inverse(parameters[site.name].to(site.dtype)).double()
             for site, to_value in zip(self.sites, self.maps, strict=True)
         ]
-        return torch.stack(columns, dim=-1)
+        return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 
     @unvalidated()
     def on_support(self, parameters: Mapping[str, Tensor]) -> Tensor:

@@ -41,8 +41,12 @@ from npdr_ppl.language.sites import BlackBox
 
 __all__ = ["LatentSite", "Prior"]
 
-_NUM_CHECKED = 16
-"""Random points at which sites are checked for their dependence on each other."""
+_CHECKED_SCALES = 1.0, 2.0, 4.0, 8.0
+"""Standard deviations of the points at which sites are checked for their dependence on each other:
+a distribution may change only far from the middle of another one."""
+
+_NUM_CHECKED = 64
+"""Number of such points of each standard deviation."""
 
 
 class Prior:
@@ -169,6 +173,7 @@ class Prior:
             return None
         generator = torch.Generator().manual_seed(0)
         z = torch.randn(_NUM_CHECKED, self.num_parameters, generator=generator).double()
+        z = torch.cat([scale * z for scale in _CHECKED_SCALES])
         return IndependentSites.of(
             self.sites, self.distributions, self._run(WriteCoordinates(self.sites, z))
         )

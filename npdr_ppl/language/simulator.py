@@ -11,7 +11,13 @@ from torch import Tensor
 
 from npdr_ppl.errors import DataError, ModelError
 from npdr_ppl.language.channels import Channel, Follower, Parameter, Port, Spin, find_port
-from npdr_ppl.language.effects import ComplianceEffect, Effect, ParameterEffect, ServoEffect
+from npdr_ppl.language.effects import (
+    ComplianceEffect,
+    Effect,
+    ForceEffect,
+    ParameterEffect,
+    ServoEffect,
+)
 from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.language.linear_dynamics import InverseDynamics
 
@@ -107,7 +113,7 @@ class Simulator(ABC):
                 )
             if isinstance(effect, ComplianceEffect) and not self.takes_compliance:
                 raise ModelError(f"{self.name} cannot apply {effect.id}, which adds a joint.")
-            if not effect.suits(port):
+            if not effect.suits(port) or (port.is_floating and not _may_float(effect)):
                 raise ModelError(
                     f"{effect.id} makes no sense at the port {port.name!r} of {self.name}, "
                     f"through which pass {port.unit}."
@@ -133,12 +139,13 @@ class Simulator(ABC):
         """
         return ""
 
-    @property
-    def joints_of_unknown_speed(self) -> Mapping[str, str]:
-        """Force ports whose rated speed is a guess, and the state that tells how fast they move.
+    def speeds_at_starts(self, inputs: Inputs) -> dict[str, Tensor]:
+        """Returns the velocities at force ports whose rated speed is a guess, ``(S,)`` by port.
 
-        It is the joint's position, or the spin of a body that floats. There are none where the
-        author of the model states the speeds.
+        There are none where the author of the model states the speeds.
+
+        Args:
+            inputs: The segments, at whose starts they are.
         """
         return {}
 
@@ -293,3 +300,13 @@ class Simulator(ABC):
                 own = effect.own_parameters(parameters)
                 result[effect.port] = effect.change(result[effect.port], own, time)
         return result
+
+
+def _may_float(effect: Effect) -> bool:
+    """Returns whether an effect can attach to an axis of a floating body."""
+    return (
+        isinstance(effect, ForceEffect)
+        and effect.acts_on_floating
+        and not effect.needs_joint
+        and type(effect).dry_friction is ForceEffect.dry_friction
+    )

@@ -139,6 +139,7 @@ def with_spins(states: InitialStates, simulator: Simulator, rollouts: Rollouts) 
     for spin in spins:
         columns, own = [names.index(leader) for leader in spin.leaders], names.index(spin.name)
         quaternion = values[:, columns]
+        quaternion = quaternion / quaternion.square().sum(-1, keepdim=True)  # q̇ has its norm
         signed = torch.stack([s * quaternion[:, k] for k, s in _OF_RATES[spin.axis]], dim=-1)
         values[:, own] = 2.0 * (signed * states.rates[:, columns]).sum(-1)
         errors[:, own] = 2.0 * (signed * rate_errors[:, columns]).square().sum(-1).sqrt()

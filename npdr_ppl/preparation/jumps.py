@@ -17,17 +17,17 @@ from npdr_ppl.preparation.settings import LINEARISATION
 
 __all__ = ["Jumps", "jumps_of"]
 
-_NUM_PARTS = 8
+_NUM_PARTS = 64
 """Parts into which the width of a difference quotient is divided to find a jump in one of them. A
-straight line changes by an eighth in each, and a kink by a quarter at most."""
+straight line changes as much in each, and a kink in each on one side of it."""
 
 _MOST = 0.5
 """Least share of a change that happens in one of the parts at a jump."""
 
 _MISLEADING = 0.1
-"""Share of the apparent information about a parameter from which jumps in it mislead. On a leg
-that squats and hops, it is 0.19 to 0.96 for four parameters, whose errors are up to 435 standard
-deviations, and below 0.001 for the others."""
+"""Share of what a recording seems to tell about a parameter, above which the user is warned if it
+comes from jumps. On a leg that squats and hops, it is 0.19 to 0.96 for four parameters, whose
+errors are up to 435 standard deviations, and below 0.001 for the others."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,9 @@ class Jumps:
         if not self.misled:
             return ""
         return (
-            f"The simulation jumps in {int(self.is_jump.sum())} of {len(self.is_jump)} segments "
-            f"as {', '.join(self.misled)} change, as where something touches or slips: the values "
-            "can be wrong by many times their intervals. A recording without such moments tells "
-            "more."
+            f"The simulation jumps in {int(self.is_jump.sum())} of {len(self.is_jump)} segments, "
+            "as where something touches or slips, so that values can be wrong by many times their "
+            f"intervals: {', '.join(self.misled)}. Fit them on a recording without contacts."
         )
 
 
@@ -67,19 +66,19 @@ def jumps_of(likelihood: SegmentLikelihood) -> Jumps:
     """Finds the segments in which the simulation jumps near the closest fit.
 
     Within the width of the difference quotients, a segment jumps if most of its change happens in
-    one of eight parts. Only changes by more than an average segment's are looked at.
+    one of many parts. Only changes by more than an average segment's are looked at.
 
     Args:
         likelihood: The likelihood at the closest fit.
     """
-    width, num_segments = LINEARISATION.parameter_step, len(likelihood.fit.offsets)
+    half, num_segments = LINEARISATION.parameter_step, len(likelihood.fit.offsets)
     here = _at(likelihood, likelihood.fit.z[None])
     told, is_bent = [], []
     for k in range(d := len(likelihood.fit.z)):  # one by one, to bound the memory
-        down, up = _at(likelihood, _moved(likelihood.fit.z, k, torch.tensor([-width, width])))
+        down, up = _at(likelihood, _moved(likelihood.fit.z, k, torch.tensor([-half, half])))
         change = (up - down).norm(dim=-1)
         is_bent.append((up - 2.0 * here[0] + down).norm(dim=-1) > _MOST * change)
-        told.append((change / (2.0 * width)).square().nan_to_num(0.0))
+        told.append((change / (2.0 * half)).square().nan_to_num(0.0))
     told, is_bent = torch.stack(told), torch.stack(is_bent)  # (d, S)
     total = told.sum(1, keepdim=True) + 1.0
     is_jump = is_bent & (told > total / num_segments)
@@ -105,8 +104,8 @@ def _steep(likelihood: SegmentLikelihood, wanted: Tensor) -> Tensor:
         likelihood: The likelihood of some segments.
         wanted: Mask of the coordinates to change, ``(d,)``.
     """
-    width = LINEARISATION.parameter_step
-    places = torch.linspace(-width, width, _NUM_PARTS + 1)
+    half = LINEARISATION.parameter_step
+    places = torch.linspace(-half, half, _NUM_PARTS + 1)
     result = torch.zeros(len(wanted), len(likelihood.fit.offsets), dtype=torch.bool)
     for k in wanted.nonzero()[:, 0].tolist():
         parts = _at(likelihood, _moved(likelihood.fit.z, k, places)).diff(dim=0).norm(dim=-1)
@@ -127,14 +126,13 @@ def _moved(z: Tensor, k: int, by: Tensor) -> Tensor:
 
 
 def _along(likelihood: SegmentLikelihood, index: Tensor) -> SegmentLikelihood:
-    """Returns the likelihood of some of the segments, with the noise of all."""
+    """Returns the likelihood of some of the segments, up to the scale of the noise."""
     fit, now = likelihood.fit, likelihood.linearisation
     return replace(
         likelihood,
         segments=likelihood.segments.along(index),
-        fit=SegmentFit(fit.z, fit.offsets[index], fit.scale * likelihood.variance**0.5),
+        fit=SegmentFit(fit.z, fit.offsets[index], fit.scale),
         linearisation=Linearisation(
             now.residual[index], now.by_parameters[index], now.by_starts[index]
         ),
-        is_noise_declared=True,
     )

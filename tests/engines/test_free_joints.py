@@ -9,7 +9,13 @@ from npdr_ppl.engines.mujoco import MujocoSimulator
 from npdr_ppl.errors import ModelError
 from npdr_ppl.language.channels import Spin
 from npdr_ppl.language.inputs import Inputs
-from npdr_ppl.models.effects import CoulombFriction, QuadraticDrag, ViscousFriction, effects
+from npdr_ppl.models.effects import (
+    CoulombFriction,
+    QuadraticDrag,
+    ViscousFriction,
+    candidate_effects,
+    effects,
+)
 from npdr_ppl.rollouts.collection import with_followers
 from tests.helpers.command_line import run
 from tests.helpers.exported_robots import difference
@@ -188,15 +194,52 @@ def test_drag_about_an_axis_slows_the_spin(tmp_path):
 
 def test_what_needs_a_bearing_or_a_position_is_refused(tmp_path):
     simulator = robot(tmp_path, FREE, "free.xml")
-    suited = {
-        name
-        for name, effect in effects().items()
-        if "force" in effect.port_kinds
-        and effect("root_x_force").suits(simulator.port("root_x_force"))
-    }
-    assert suited == {"viscous_friction", "quadratic_drag"}
+    acting = {name for name, e in effects().items() if getattr(e, "acts_on_floating", False)}
+    assert acting == {"viscous_friction", "quadratic_drag"}
+    proposed = {e.id for e in candidate_effects(simulator) if e.port == "root_y_torque"}
+    assert proposed == acting
     with pytest.raises(ModelError, match="coulomb_friction makes no sense at the port 'root_x_"):
         simulator.with_effects(CoulombFriction("root_x_force"))
+
+    class Sticking(CoulombFriction):
+        acts_on_floating = True
+
+    with pytest.raises(ModelError, match="makes no sense"):
+        simulator.with_effects(Sticking("root_x_force"))
+
+
+def test_a_port_has_a_name_of_its_own(tmp_path):
+    joints = '<joint name="root_x" axis="1 0 0"/><joint name="root" type="ball"/>'
+    names = robot(tmp_path, joints, "neck.xml").joints
+    assert names == (
+        "root_x_torque", "root_x_torque_at_joint", "root_y_torque", "root_z_torque",
+    )  # fmt: skip
+    bodies = '<body><joint name="root_x_torque" axis="1 0 0"/><geom size="0.1"/></body>'
+    path = tmp_path / "two.xml"
+    path.write_text(
+        f'<mujoco><worldbody><body><joint name="root" type="ball"/><geom size="0.1"/>{bodies}'
+        "</body></worldbody></mujoco>"
+    )
+    names = MujocoSimulator(path).joints
+    assert len(set(names)) == len(names) == 4
+
+
+def test_speeds_are_those_along_the_axes_of_the_body(tmp_path):
+    free = robot(tmp_path, FREE, "free.xml")
+    names = tuple(state.name for state in free.states)
+    # The body points along the world's y-axis.
+    start = {"root_qw": 1.0, "root_qz": 1.0, "root_y_velocity": 3.0, "root_x_velocity": 0.2}
+    inputs = Inputs.single(
+        torch.zeros(5, 1).double(),
+        torch.tensor([start.get(name, 0.0) for name in names]).double(),
+        action_names=("thrust",),
+        state_names=names,
+        time_step=0.01,
+    )
+    speeds = free.speeds_at_starts(inputs)
+    assert speeds.keys() == set(PORTS)
+    assert float(speeds["root_x_force"]) == pytest.approx(3.0)
+    assert float(speeds["root_y_force"]) == pytest.approx(-0.2)
 
 
 @pytest.mark.parametrize("port", ["root_x_force", "root_y_torque"])

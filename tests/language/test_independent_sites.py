@@ -34,6 +34,16 @@ def dependent_by_kind():
     pyro.sample("child", dist.Uniform(torch.where(sign > 0.0, -1.0, 0.0), 1.0))
 
 
+def dependent_support():
+    least = pyro.sample("least", dist.Normal(0.0, 1.0))
+    pyro.sample("child", dist.Uniform(least, least + 1.0))
+
+
+def dependent_far_away():
+    first = pyro.sample("first", dist.Normal(0.0, 1.0))
+    pyro.sample("child", dist.Normal(torch.relu(first - 3.5), 0.1))
+
+
 def vector():
     pyro.sample("mean", dist.Normal(torch.zeros(2), 1.0).to_event(1))
 
@@ -114,11 +124,13 @@ def test_coordinates_can_be_differentiated(both):
     assert own == pytest.approx(wanted.numpy(), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "model",
-    [dependent, dependent_by_kind, vector, in_a_plate, learnable],
-    ids=lambda m: m.__name__,
-)
+OTHERS = [
+    dependent, dependent_by_kind, dependent_support, dependent_far_away, vector, in_a_plate,
+    not_normal, learnable,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("model", OTHERS, ids=lambda model: model.__name__)
 def test_other_programs_are_run(model):
     pyro.clear_param_store()
     assert Prior(model)._independent is None

@@ -58,7 +58,8 @@ def test_a_jump_that_seems_to_tell_much_is_found(place):
     assert jumps.is_jump.nonzero().tolist() == [[0]]
     assert jumps.misled == ("mass",)
     assert jumps.shares[0] > 0.5 > 1e-6 > jumps.shares[1]
-    assert str(jumps).startswith(f"The simulation jumps in 1 of {NUM} segments as mass change, ")
+    assert str(jumps).startswith(f"The simulation jumps in 1 of {NUM} segments, as where ")
+    assert "many times their intervals: mass. " in str(jumps)
 
 
 @pytest.mark.parametrize(
@@ -67,11 +68,12 @@ def test_a_jump_that_seems_to_tell_much_is_found(place):
         lambda z: 0.0 * z,
         lambda z: 300.0 * z,  # steep, but straight
         lambda z: 300.0 * z.clamp_min(0.002),  # a kink, as of dry friction
+        lambda z: 300.0 * z.clamp_min(0.006),
         lambda z: 3e4 * z**2,
         lambda z: 1e-3 * (z > 0.0),  # a jump that tells nothing
         lambda z: 0.5 * torch.nan * z,  # a simulation that fails
     ],
-    ids=["line", "steep", "kink", "bend", "little", "failure"],
+    ids=["line", "steep", "kink", "late kink", "bend", "little", "failure"],
 )
 def test_nothing_else_is_taken_for_a_jump(other):
     jumps = found(other)

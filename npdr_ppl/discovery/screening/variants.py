@@ -56,17 +56,14 @@ def _recorded_speeds(hypothesis: Hypothesis) -> dict[str, float]:
     It is at least ``LEAST_SPEED`` of the rated one: the rates of a joint that only trembles are
     noise.
     """
-    segments, result = hypothesis.segments, {}
+    segments = hypothesis.segments
     if segments.recorded_rates is None:
-        return result
-    channels, simulator = segments.inputs.channel_names, hypothesis.simulator
-    is_rate = {s.name: rate for s, rate in zip(simulator.states, simulator.is_rate, strict=True)}
-    for port, state in simulator.joints_of_unknown_speed.items():
-        if state in channels:
-            values = segments.inputs.initial_values if is_rate[state] else segments.recorded_rates
-            rates = values[..., channels.index(state)]
-            least = LEAST_SPEED * simulator.port(port).rated_speed
-            result[port] = max(least, float(rates.nan_to_num(0.0).abs().max()))
+        return {}
+    inputs = replace(segments.inputs, initial_rates=segments.recorded_rates)
+    result = {}
+    for port, speeds in hypothesis.simulator.speeds_at_starts(inputs).items():
+        least = LEAST_SPEED * hypothesis.simulator.port(port).rated_speed
+        result[port] = max(least, float(speeds.nan_to_num(0.0).abs().max()))
     return result
 
 

@@ -35,7 +35,13 @@ from npdr_ppl.engines.mujoco.environment import environment_ports, with_environm
 from npdr_ppl.engines.mujoco.fields import element_names, find_field
 from npdr_ppl.engines.mujoco.native_laws import is_native, native_law
 from npdr_ppl.engines.mujoco.parameters import Assignments, Binding, Bindings, Derivation
-from npdr_ppl.engines.mujoco.ports import derive_ports, driven_dofs, force_ports
+from npdr_ppl.engines.mujoco.ports import (
+    TO_QUATERNION,
+    body_axis,
+    derive_ports,
+    driven_dofs,
+    force_ports,
+)
 from npdr_ppl.engines.mujoco.second_joints import (
     SecondJoint,
     WithSecondJoints,
@@ -52,6 +58,7 @@ from npdr_ppl.language.effects import (
     ParameterEffect,
     ServoEffect,
 )
+from npdr_ppl.language.inputs import Inputs
 from npdr_ppl.registry import hint
 
 __all__ = ["MujocoMechanism"]
@@ -149,18 +156,24 @@ class MujocoMechanism(ClosedLoopSimulator):
             return ""
         return self._held_at.get(effect.port, "")
 
-    @property
-    def joints_of_unknown_speed(self) -> dict[str, str]:
-        """All force ports: an MJCF does not tell how fast its joints and bodies move."""
-        states = {(c.is_velocity, c.address): c.channel.name for c in self.components}
-        found = dict(self.position_states)
-        for port in (p for p in self.force_ports if p.port.is_floating):
-            place = True, port.velocity
+    def speeds_at_starts(self, inputs: Inputs) -> dict[str, Tensor]:
+        """Returns those of all force ports: an MJCF does not tell how fast its joints move."""
+        states = zip(self.components, self.initial_states(inputs), strict=True)
+        found = {(c.is_velocity, c.address): value.double() for c, value in states}
+        result = {}
+        for port in self.force_ports:
+            needed = [(True, port.velocity)]
             if port.axis is not None:
-                place = False, int(self.model.jnt_qposadr[port.joint]) + port.axis
-            if place in states:
-                found[port.port.name] = states[place]
-        return found
+                first = int(self.model.jnt_qposadr[port.joint]) + TO_QUATERNION
+                needed = [(True, k) for k in range(port.in_world.start, port.in_world.stop)]
+                needed += [(False, first + k) for k in range(4)]
+            if not all(place in found for place in needed):
+                continue
+            values = torch.stack([found[place].reshape(-1) for place in needed], dim=-1).numpy()
+            if port.axis is not None:
+                values = body_axis(values[:, 3:], port.axis) * values[:, :3]
+            result[port.port.name] = torch.from_numpy(values.sum(-1))
+        return result
 
     @property
     def position_states(self) -> dict[str, str]:

@@ -81,6 +81,7 @@ def native_law(
     if effect.standard_law == "dry friction":
         key = "dof_frictionloss", port.velocity
         return {key: present(model, *key, assignments) + values["magnitude"]}
+    assert port.position is not None  # of a hinge or slide
     return {
         ("jnt_stiffness", port.joint): values["stiffness"],
         ("qpos_spring", port.position): values["rest"],

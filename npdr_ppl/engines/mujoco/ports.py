@@ -15,12 +15,23 @@ from npdr_ppl.engines.mujoco.fields import actuated_joint, element_names, joint_
 from npdr_ppl.engines.mujoco.servos import is_servo
 from npdr_ppl.language.channels import Channel, Port
 
-__all__ = ["ForcePort", "actuator_moments", "derive_ports", "driven_dofs", "force_ports"]
+__all__ = [
+    "TO_QUATERNION",
+    "ForcePort",
+    "actuator_moments",
+    "body_axis",
+    "derive_ports",
+    "driven_dofs",
+    "force_ports",
+]
 
 Array = NDArray[np.float64]
 
 # A servo's error in a fast motion, as a share of the joint's rated excursion.
 _LARGE_ERROR = 0.05
+
+TO_QUATERNION = 3
+"""Of a free joint's positions, the number of those before its orientation."""
 
 _NUM_POSES = 32
 """Random poses over which inertias are averaged. On the seven-joint arm of
@@ -79,7 +90,8 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
     for joint, name in enumerate(element_names(model, "joint")):
         is_slide = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
         if not is_slide and int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_HINGE):
-            result += _floating_ports(model, joint, name, inertias, taken)
+            known = [*element_names(model, "joint"), *(p.port.name for p in result)]
+            result += _floating_ports(model, joint, name, inertias, [*taken, *known])
             continue
         dof = int(model.jnt_dofadr[joint])
         inertia, damping = float(inertias[dof]), float(model.dof_damping[dof])
@@ -92,7 +104,7 @@ def force_ports(model: Any, taken: Sequence[str]) -> tuple[ForcePort, ...]:
             speed = min(speed, rated / damping)
         if name in taken:
             name = f"{name}_{'force' if is_slide else 'torque'}"
-        if name in taken:  # for example by an actuator, which is a port as well
+        if name in (*taken, *(p.port.name for p in result)):  # such as an actuator's
             name = f"{name}_at_joint"
         units = joint_units(model, joint)
         port = Port(
@@ -122,7 +134,7 @@ def _floating_ports(
         joint: Number of the joint.
         name: Its name.
         inertias: Mean inertia about each degree of freedom.
-        taken: Names of channels.
+        taken: Names of channels, joints and other ports.
     """
     mujoco: Any = importlib.import_module("mujoco")
     first, body = int(model.jnt_dofadr[joint]), int(model.jnt_bodyid[joint])
@@ -149,6 +161,20 @@ def _floating_ports(
         )
         result.append(ForcePort(port, joint, None, dof, k if is_force else None))
     return result
+
+
+def body_axis(quaternions: Array, axis: int) -> Array:
+    """Returns an axis of a body in the world's frame, ``(N, 3)``; NaN where there is no rotation.
+
+    Args:
+        quaternions: Orientations (w, x, y, z) of any length, ``(N, 4)``.
+        axis: Number of the axis.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    w, vector, own = unit[:, :1], unit[:, 1:], np.eye(3)[axis]
+    turned = np.cross(vector, own)  # Rodrigues' formula
+    return own + 2.0 * (w * turned + np.cross(vector, turned))
 
 
 def derive_ports(
@@ -189,7 +215,7 @@ def _command_port(
     moved = actuated_joint(model, actuator)
     gear = abs(float(model.actuator_gear[actuator, 0])) or 1.0
     gain = float(model.actuator_gainprm[actuator, 0])
-    for joint in (j.port for j in joints if j.joint == moved):
+    for joint in (j.port for j in joints if j.joint == moved and j.position is not None):
         port = replace(
             port,
             rated_speed=joint.rated_speed,

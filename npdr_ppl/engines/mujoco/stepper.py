@@ -19,7 +19,7 @@ from npdr_ppl.engines.mujoco.damping import fastest_damping
 from npdr_ppl.engines.mujoco.drive_forces import DriveForces, has_direct_drives
 from npdr_ppl.engines.mujoco.joints import JointStates
 from npdr_ppl.engines.mujoco.mechanism import MujocoMechanism
-from npdr_ppl.engines.mujoco.ports import ForcePort
+from npdr_ppl.engines.mujoco.ports import TO_QUATERNION, ForcePort, body_axis
 from npdr_ppl.engines.mujoco.second_joints import IMMOVABLE
 from npdr_ppl.engines.mujoco.servos import ServoErrors
 
@@ -27,9 +27,6 @@ __all__ = ["ACCELERATION_STAGE", "MujocoStepper", "lost_simulations"]
 
 ACCELERATION_STAGE = 3
 """Stage of sensors that depend on accelerations."""
-
-_TO_QUATERNION = 3
-"""Of a free joint's positions, the number of those before its orientation."""
 
 _MOST_DAMPED_PER_PART = 0.5
 """Rate of the fastest damping, per part of a step, up to which the midpoint rule follows it: its
@@ -79,6 +76,8 @@ class MujocoStepper(EffectChain):
         )
         self.simulator: MujocoMechanism = simulator
         self.forces.effects = [f for f in self.forces.effects if not simulator.is_native(f[1])]
+        # Velocities along a floating body's own axes are computed only where an effect acts.
+        self._acted_on = {effect.port for _, effect, _ in self.forces.effects}
         servo_effects = simulator.servo_effects
         self.has_forces = bool(servo_effects or self.forces.effects)
         self._batch = batch
@@ -263,21 +262,16 @@ class MujocoStepper(EffectChain):
         )
 
     def _velocity(self, port: ForcePort) -> Tensor:
-        if port.axis is None:
+        if port.axis is None or port.port.name not in self._acted_on:
             return _column(self._qvel, port.velocity)
         along = self._direction(port) * self._qvel[:, port.in_world]
         return torch.from_numpy(along.sum(axis=1))
 
     def _direction(self, port: ForcePort) -> NDArray[np.float64]:
         """Returns the axis of a floating body in the world's frame, ``(N, 3)``."""
-        first = int(self.simulator.model.jnt_qposadr[port.joint]) + _TO_QUATERNION
-        w, *xyz = self._qpos[:, first : first + 4].T / np.linalg.norm(
-            self._qpos[:, first : first + 4], axis=1
-        )
-        vector, axis = np.stack(xyz, axis=1), np.eye(3)[port.axis]
-        # Rodrigues' rotation of the axis by a unit quaternion.
-        turned = np.cross(vector, axis)
-        return axis + 2.0 * (w[:, None] * turned + np.cross(vector, turned))
+        assert port.axis is not None
+        first = int(self.simulator.model.jnt_qposadr[port.joint]) + TO_QUATERNION
+        return body_axis(self._qpos[:, first : first + 4], port.axis)
 
     @property
     def position_channels(self) -> tuple[str | None, ...]:

@@ -50,7 +50,8 @@ class Effect(ABC):
         strength: Names of the parameters that scale the effect from zero; the others set its
             shape, and their nominal values are those of a typical device. Empty for all.
         is_smooth: Whether trajectories change in proportion to small strengths, up to typical
-            ones. If not, a search tries the sizes that :meth:`probe` gives.
+            ones. If not, a search tries the sizes that :meth:`probe` gives, of both signs if all
+            strengths can be negative.
         is_resonant: Whether the effect oscillates at a rate that its strength, a time constant,
             sets. The effect then does not simply grow with its strength, so a search tries many
             values.

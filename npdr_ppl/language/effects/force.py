@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from npdr_ppl.language.channels import Port, PortKind
+from npdr_ppl.language.channels import PortKind
 from npdr_ppl.language.effect_context import Joint, Start
 from npdr_ppl.language.effects.effect import Effect
 
@@ -25,8 +25,9 @@ class ForceEffect(Effect):
         standard_law: ``"damping"`` with the parameter ``damping``, ``"dry friction"`` with
             ``magnitude``, or ``"spring"`` with ``stiffness`` and ``rest``, if the law is one that
             engines have themselves; else empty. A subclass with another law makes it empty.
-        acts_on_floating: Whether the law makes sense at an axis of a floating body; see
-            :attr:`Port.is_floating`.
+        acts_on_floating: Whether it can attach to an axis of a floating body; see
+            :attr:`Port.is_floating`. The position is NaN there. Such a law has no dry friction and
+            does not need the joint.
     """
 
     port_kinds: ClassVar[tuple[PortKind, ...]] = ("force",)
@@ -35,10 +36,6 @@ class ForceEffect(Effect):
     needs_past: ClassVar[bool] = False
     standard_law: ClassVar[str] = ""
     acts_on_floating: ClassVar[bool] = False
-
-    def suits(self, port: Port) -> bool:
-        """Returns whether the law makes sense at a port; see :attr:`acts_on_floating`."""
-        return self.acts_on_floating or not port.is_floating
 
     def initial_memory(self, position: Tensor, velocity: Tensor, start: Start) -> Any:
         """Returns the effect's own state at a segment's start; ``None`` if it has none."""

@@ -56,7 +56,7 @@ def pose_parts(names: Collection[str]) -> dict[str, tuple[str, str]]:
     Args:
         names: Names of the model's columns.
     """
-    own = [re.sub("_qw$", "", name) for name in names if name.endswith("_qw")]
+    own = sorted((name[:-3] for name in names if name.endswith("_qw")), key=len, reverse=True)
     result = {}
     for name in names:
         short = next((name[len(body) :] for body in own if name.startswith(f"{body}_")), None)
