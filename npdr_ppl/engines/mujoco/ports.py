@@ -170,11 +170,14 @@ def body_axis(quaternions: Array, axis: int) -> Array:
         quaternions: Orientations (w, x, y, z) of any length, ``(N, 4)``.
         axis: Number of the axis.
     """
+    w, q = quaternions[:, 0], quaternions[:, 1:].T
+    second, third = (axis + 1) % 3, (axis + 2) % 3
+    result = np.empty((len(quaternions), 3))
+    result[:, axis] = w * w + q[axis] ** 2 - q[second] ** 2 - q[third] ** 2
+    result[:, second] = 2.0 * (q[axis] * q[second] + w * q[third])
+    result[:, third] = 2.0 * (q[axis] * q[third] - w * q[second])
     with np.errstate(invalid="ignore", divide="ignore"):
-        unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    w, vector, own = unit[:, :1], unit[:, 1:], np.eye(3)[axis]
-    turned = np.cross(vector, own)  # Rodrigues' formula
-    return own + 2.0 * (w * turned + np.cross(vector, turned))
+        return result / np.square(quaternions).sum(1, keepdims=True)
 
 
 def derive_ports(
