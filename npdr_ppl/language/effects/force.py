@@ -26,7 +26,7 @@ class ForceEffect(Effect):
             ``magnitude``, or ``"spring"`` with ``stiffness`` and ``rest``, if the law is one that
             engines have themselves; else empty. A subclass with another law makes it empty.
         acts_on_floating: Whether it can attach to an axis of a floating body; see
-            :attr:`Port.is_floating`. The position is NaN there. Such a law has no dry friction and
+            ``Port.is_floating``. The position is NaN there. Such a law has no dry friction and
             does not need the joint.
     """
 
