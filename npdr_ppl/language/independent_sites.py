@@ -51,8 +51,6 @@ class IndependentSites:
             return None
         for site, own in zip(sites, found.distributions, strict=True):
             node = trace.nodes[site.name]
-            if type(own) is not type(_without_batch(node["fn"])):
-                return None
             if not torch.equal(own.log_prob(node["value"]), node["fn"].log_prob(node["value"])):
                 return None
         return found
@@ -92,12 +90,3 @@ class IndependentSites:
         for site, distribution in zip(self.sites, self.distributions, strict=True):
             total = total + distribution.log_prob(values[site.name])
         return total
-
-
-def _without_batch(distribution: Any) -> Any:
-    """Returns a distribution without the batch dimension that a plate has added."""
-    from pyro.distributions.torch_distribution import ExpandedDistribution
-
-    while isinstance(distribution, ExpandedDistribution):
-        distribution = distribution.base_dist
-    return distribution

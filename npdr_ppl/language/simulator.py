@@ -113,7 +113,12 @@ class Simulator(ABC):
                 )
             if isinstance(effect, ComplianceEffect) and not self.takes_compliance:
                 raise ModelError(f"{self.name} cannot apply {effect.id}, which adds a joint.")
-            if not effect.suits(port) or (port.is_floating and not _may_float(effect)):
+            if port.is_floating and not _may_float(effect):
+                raise ModelError(
+                    f"{effect.id} cannot attach to {port.name!r} of {self.name}: a body that "
+                    "floats has no position there, no bearing that rubs and no joint."
+                )
+            if not effect.suits(port):
                 raise ModelError(
                     f"{effect.id} makes no sense at the port {port.name!r} of {self.name}, "
                     f"through which pass {port.unit}."
