@@ -9,9 +9,9 @@ import torch
 from npdr_ppl.discovery.discovery_options import DiscoveryOptions
 from npdr_ppl.discovery.hypothesis import Hypothesis
 from npdr_ppl.discovery.screening.equivalents import irreducible
+from npdr_ppl.discovery.screening.force_shapes import force_shape
 from npdr_ppl.discovery.screening.generic_laws import strongest_frequency, strongest_ripple
 from npdr_ppl.discovery.screening.latent_force import Responses
-from npdr_ppl.discovery.screening.linear_shapes import linear_shape
 from npdr_ppl.discovery.screening.projection import Projection
 from npdr_ppl.discovery.screening.rounded_commands import strongest_rounding
 from npdr_ppl.discovery.screening.sensitivities import Variant, sensitivities
@@ -76,8 +76,8 @@ def variants_of(
 ) -> Iterator[Variant]:
     """Yields the candidates in all shapes and sizes, waves also at the strongest frequency.
 
-    Ripples have the strongest number per turn, roundings also the strongest step, and springs also
-    the rest position that explains most.
+    Ripples have the strongest number per turn, roundings also the strongest step, and springs and
+    winds also the shape that explains most.
 
     Args:
         candidates: The effects.
@@ -98,7 +98,7 @@ def variants_of(
             step = strongest_rounding(projection, found, port.name, port.joint, largest)
             if step is not None:
                 hints[effect.name] = {effect.rounds: step}
-        elif shape := linear_shape(projection, found, effect):
+        elif shape := force_shape(projection, found, effect):
             hints[effect.name] = shape
     candidates, numbered = _with_ripples(candidates, projection, found)
     for variant in _in_all_shapes(projection, candidates, hints, number):
