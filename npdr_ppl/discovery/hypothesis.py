@@ -61,8 +61,7 @@ class Hypothesis:
     @cached_property
     def difference(self) -> Tensor:
         """Measurement minus simulation at the fit, ``(S, K, C)``."""
-        simulated = self.segments.simulate(self.fit.z[None], self.fit.offsets[None])[0]
-        difference = self.segments.observed - simulated
+        difference = self.segments.difference(self.fit.z[None], self.fit.offsets[None])[0]
         _KEPT.add(self, "difference", difference.nbytes)
         return difference
 
@@ -317,20 +316,21 @@ def fit_segment_model(
         if held and site.name in held:
             z[site.coordinates], stays[site.coordinates] = held[site.name], True
 
-    last: Linearisation | None = None
+    made: SegmentFit | None = None
 
     def make() -> dict[str, Tensor]:
-        nonlocal last
-        found = fit_segments(
+        nonlocal made
+        made = fit_segments(
             segments, z, offsets=offsets, held=stays, max_steps=max_steps, is_rough=is_rough
         )
-        last = found.linearisation
-        return {"z": found.z, "offsets": found.offsets, "scale": found.scale}
+        return {"z": made.z, "offsets": made.offsets, "scale": made.scale}
 
     fit = made_or_read(make, segments, z, offsets, stays, max_steps, is_rough)
-    made = Hypothesis(
+    found = Hypothesis(
         segments.model, effects, segments, SegmentFit(fit["z"], fit["offsets"], fit["scale"])
     )
-    if last is not None:
-        made.keep_linearisation(last)
-    return made
+    if made is not None and made.linearisation is not None:
+        found.keep_linearisation(made.linearisation)
+    if made is not None and made.difference is not None:
+        found.keep_difference(made.difference)
+    return found

@@ -337,6 +337,7 @@ def _likelihood(base: BaseFit, is_declared: bool) -> SegmentLikelihood:
         return found.likelihood
     fit = fit_segments(found.segments, found.fit.z, offsets=found.fit.offsets, scale=scale)
     now = found.segments.linearise(fit.z, fit.offsets, scale)
+    fit = replace(fit, difference=None)  # of a long recording it is large
     return SegmentLikelihood(found.segments, fit, now, found.share, is_noise_declared=True)
 
 

@@ -14,6 +14,7 @@ own curvature (Marquardt 1963). With one damping for all parameters, the well-de
 of a Furuta pendulum forced steps so small that its masses did not converge.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -43,12 +44,26 @@ class SegmentFit:
         scale: Root-mean-square residual per channel, in its unit, ``(C,)``.
         linearisation: Residuals and derivatives there, whitened by the scale; ``None`` if the fit
             ended without them.
+        difference: Measurement minus simulation there, ``(S, K, C)``; ``None`` if the fit ended
+            without it.
     """
 
     z: Tensor
     offsets: Tensor
     scale: Tensor
     linearisation: Linearisation | None = None
+    difference: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where steps have ended; see :class:`SegmentFit`."""
+
+    z: Tensor
+    offsets: Tensor
+    scale: Tensor
+    linearisation: Linearisation | None
+    difference: Tensor | None
 
 
 def fit_segments(
@@ -91,51 +106,37 @@ def fit_segments(
     model, now = segments.corrected(z, offsets, begun, is_rough=scale is None)
     if not bool(now.residual.isfinite().all()):
         raise DataError("The simulation fails at the parameters that the fit begins with.")
+    first = model, now
     if scale is not None:
-        first = model, now
-        z, offsets, _, _ = _steps(
-            segments, z, offsets, begun, held, max_steps, is_rough=False, first=first
-        )
-        return SegmentFit(z, offsets, begun)
+        end = _steps(segments, z, offsets, begun, held, max_steps, is_rough=False, first=first)
+        return SegmentFit(end.z, end.offsets, begun, difference=end.difference)
     present = _scale(segments, _by_channel(now.residual, unit), unit)
     first = model, now.rescaled(unit / present)
-    z, offsets, left, last = _steps(
-        segments, z, offsets, present, held, max_steps, is_rough=True, first=first
-    )
-    if not is_rough:
-        first = segments.corrected(z, offsets, left)
-        share = segments.effective_share(first[1].residual)
+    end = _steps(segments, z, offsets, present, held, max_steps, is_rough=True, first=first)
+    if is_rough:
+        return SegmentFit(end.z, end.offsets, end.scale, difference=end.difference)
+    first = segments.corrected(end.z, end.offsets, end.scale)
+    share = segments.effective_share(first[1].residual)
 
-        def precise(
-            z: Tensor, offsets: Tensor, scale: Tensor, first: _Place | None = None
-        ) -> tuple[Tensor, Tensor, Tensor, Linearisation | None]:
-            return _steps(
-                segments,
-                z,
-                offsets,
-                scale,
-                held,
-                max_steps,
-                is_rough=False,
-                share=share,
-                first=first,
-            )
+    def precise(z: Tensor, offsets: Tensor, scale: Tensor, first: _Place | None = None) -> _End:
+        return _steps(
+            segments, z, offsets, scale, held, max_steps, is_rough=False, share=share, first=first
+        )
 
-        z, offsets, left, last = precise(z, offsets, left, first)
-        unstuck = _unstuck_offsets(segments, z, offsets, left)
-        if unstuck is not None:
-            z, offsets, left, last = precise(z, unstuck, left)
-        for _ in range(SEGMENT_FIT.most_restarts):
-            better = _restart(segments, z, offsets, left, held)
-            if better is None:
-                break
-            z, offsets, left, last = precise(*better, left)
-    return SegmentFit(z, offsets, left, None if is_rough or bool(held.any()) else last)
+    end = precise(end.z, end.offsets, end.scale, first)
+    unstuck = _unstuck_offsets(segments, end)
+    if unstuck is not None:
+        end = precise(end.z, unstuck, end.scale)
+    for _ in range(SEGMENT_FIT.most_restarts):
+        better = _restart(segments, end.z, end.offsets, end.scale, held)
+        if better is None:
+            break
+        end = precise(*better, end.scale)
+    last = None if bool(held.any()) else end.linearisation
+    return SegmentFit(end.z, end.offsets, end.scale, last, end.difference)
 
 
-def _unstuck_offsets(
-    segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor
-) -> Tensor | None:
+def _unstuck_offsets(segments: SegmentModel, end: _End) -> Tensor | None:
     """Returns offsets from which badly fitted segments can improve; ``None`` if there are none.
 
     Where dry friction holds a joint, the simulation does not depend on the segment's initial rate,
@@ -144,13 +145,14 @@ def _unstuck_offsets(
 
     Args:
         segments: The model and the recording.
-        z: Parameters, ``(d,)``.
-        offsets: Offsets of the initial states, ``(S, m)``.
-        scale: Standard deviation of each channel's residuals, ``(C,)``.
+        end: Where the fit has ended.
     """
     if not segments.num_offsets:
         return None
-    misfit = _squares(segments, z[None], offsets[None, None], scale)[0, 0].sum(-1)
+    z, offsets, scale, difference = end.z, end.offsets, end.scale, end.difference
+    if difference is None:
+        difference = segments.difference(z[None], offsets[None])[0]
+    misfit = _sums_of_squares(segments, difference, scale).sum(-1)
     is_outlier = misfit > SEGMENT_FIT.outlier_misfit * misfit.median()
     if not bool(is_outlier.any()):
         return None
@@ -233,7 +235,7 @@ def _steps(
     is_rough: bool,
     share: float = 1.0,
     first: _Place | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Linearisation | None]:
+) -> _End:
     """Takes steps until they gain little.
 
     Where the simulator has coarser steps, each linearisation and the trials after it take those,
@@ -261,8 +263,7 @@ def _steps(
         first: :meth:`SegmentModel.corrected` at the first point, if it is known.
 
     Returns:
-        Parameters, offsets, the scale of the residuals, and the linearisation there, whitened by
-        that scale, if it is known.
+        The end, whose scale is that of the residuals there.
     """
     damping, dampings = (
         SEGMENT_FIT.first_damping,
@@ -273,6 +274,7 @@ def _steps(
     uniform = segments.prior.uniform_coordinates
     now, model, num_updates, num_linearised = None, segments, 0, 0
     known: tuple[Tensor, Tensor, Tensor, Linearisation] | None = None
+    difference: Tensor | None = None
     found: tuple[float, Tensor, Tensor, Tensor] | None = None
     most_updates = 0 if has_minima else _most_updates(segments, held, is_rough=is_rough)
     while True:
@@ -300,7 +302,7 @@ def _steps(
             # Corrections differ from point to point: gains count from one to the next.
             if found is not None and present > found[0] - enough:
                 if present > found[0]:
-                    _, z, offsets, present_scale = found
+                    (_, z, offsets, present_scale), difference = found, None
                 break
             found = present, z, offsets, present_scale
         if not has_minima and possible_gain(now, z, offsets, held, uniform) < enough:
@@ -313,17 +315,22 @@ def _steps(
         ]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
-        squares = _squares(model, tried, begun, scale)  # (a, b, S, C)
+        differences = _differences(model, tried, begun)  # (a, b, S, K, C)
+        squares = _sums_of_squares(model, differences, scale)  # (a, b, S, C)
         losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
         least, chosen = losses.min(1)  # (a, S)
         outcome = least.sum(-1) + tried.square().sum(-1)
         best = int(outcome.argmin())
         gain = present - float(outcome[best])
         is_little = gain < enough
+        place, every = chosen[best], torch.arange(len(offsets))
+        at_best = differences[best][place, every]
+        del differences  # large for a long recording
         if gain > 0.0:
-            place, every = chosen[best], torch.arange(len(offsets))
             last = z, offsets
             z, offsets = tried[best], begun[best][place, every]
+            # In coarser steps it is only approximate.
+            difference = at_best if model is segments else None
             damping = min(
                 max(damping * factors[best], SEGMENT_FIT.damping_limits[0]),
                 SEGMENT_FIT.damping_limits[1],
@@ -338,10 +345,9 @@ def _steps(
                 is_little = is_little and bool((scale > SEGMENT_FIT.settled_scale * before).all())
             corrected = None
             if most_updates:
-                here = model.residuals(z[None], offsets[None], scale)[0]
                 followed, change = as_moved(now, last[0], z, uniform)
                 corrected = followed.rescaled(before / scale).updated(
-                    here, change, offsets - last[1]
+                    model.whitened(at_best, scale), change, offsets - last[1]
                 )
             now = corrected
         if is_little and num_updates:
@@ -362,7 +368,7 @@ def _steps(
     last = None
     if known is not None and known[0] is z and known[1] is offsets:
         last = known[3].rescaled(known[2] / present_scale)
-    return z, offsets, present_scale, last
+    return _End(z, offsets, present_scale, last, difference)
 
 
 def _by_channel(residual: Tensor, scale: Tensor) -> Tensor:
@@ -400,11 +406,28 @@ def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) 
         offsets: For each of them, b sets of offsets, ``(a, b, S, m)``.
         scale: Standard deviation of each channel's residuals, ``(C,)``.
     """
-    a, b = offsets.shape[:2]
+    return torch.cat(
+        [_sums_of_squares(segments, part, scale) for part in _in_chunks(segments, z, offsets)]
+    ).unflatten(0, offsets.shape[:2])
+
+
+def _differences(segments: SegmentModel, z: Tensor, offsets: Tensor) -> Tensor:
+    """Returns measurements minus simulations, ``(a, b, S, K, C)``; see :func:`_squares`."""
+    parts = [*_in_chunks(segments, z, offsets)]
+    # Of a long recording every copy takes a hundred megabytes.
+    found = parts[0] if len(parts) == 1 else torch.cat(parts)
+    return found.unflatten(0, offsets.shape[:2])
+
+
+def _in_chunks(segments: SegmentModel, z: Tensor, offsets: Tensor) -> Iterator[Tensor]:
+    """Yields measurements minus simulations of some points at once, ``(n, S, K, C)``."""
     together = segments.draws_per_chunk
-    points = z.repeat_interleave(b, 0).split(together)
-    squares = [
-        segments.residuals(point, starts, scale).square().unflatten(-1, (-1, len(scale))).sum(-2)
-        for point, starts in zip(points, offsets.flatten(0, 1).split(together), strict=True)
-    ]
-    return torch.cat(squares).unflatten(0, (a, b))
+    points = z.repeat_interleave(offsets.shape[1], 0).split(together)
+    for point, starts in zip(points, offsets.flatten(0, 1).split(together), strict=True):
+        yield segments.difference(point, starts)
+
+
+def _sums_of_squares(segments: SegmentModel, difference: Tensor, scale: Tensor) -> Tensor:
+    """Returns the sums of squares of whitened differences ``(…, S, K, C)``, ``(…, S, C)``."""
+    whitened = segments.whitened(difference, scale)
+    return whitened.square().unflatten(-1, (-1, len(scale))).sum(-2)

@@ -304,6 +304,10 @@ class SimulatedSegments:
         num = torch.broadcast_shapes(simulated.shape[:-3], offsets.shape[:1])
         return simulated.expand(*num, *self.observed.shape)
 
+    def difference(self, z: Tensor, offsets: Tensor) -> Tensor:
+        """Returns measurement minus simulation, ``(n, S, K, C)``; see :meth:`simulate`."""
+        return self.observed - self.simulate(z, offsets)
+
     def residuals(self, z: Tensor, offsets: Tensor, scale: Tensor) -> Tensor:
         """Returns whitened residuals, ``(n, S, N)`` float64, zero where nothing was measured.
 
@@ -317,7 +321,7 @@ class SimulatedSegments:
         num, together = max(len(z), len(offsets)), self.draws_per_chunk
         z, offsets = (part.expand(num, *part.shape[1:]) for part in (z, offsets))
         if num <= together:
-            return self.whitened(self.observed - self.simulate(z, offsets), scale)
+            return self.whitened(self.difference(z, offsets), scale)
         parts = zip(z.split(together), offsets.split(together), strict=True)
         return torch.cat([self.residuals(*part, scale) for part in parts])
 
