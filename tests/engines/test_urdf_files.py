@@ -72,9 +72,16 @@ def test_meshes_that_are_nowhere_are_left_out_with_a_warning(tmp_path, caplog):
     model = load_mjcf(written(tmp_path, urdf("".join(map(mesh, names)))))
     assert model.ngeom == 0
     assert all(name in caplog.text for name in names)
+    load_mjcf(written(tmp_path, urdf("".join(map(mesh, names)))))
+    assert len(caplog.records) == 1
     # Without <inertial>, the link's mass would follow from the mesh.
     with pytest.raises(ModelError, match=r"link rod has no <inertial>, and its mesh lost.stl"):
         load_mjcf(written(tmp_path, urdf(mesh("lost.stl"), inertial="")))
+
+
+def test_a_warning_of_many_missing_meshes_is_short(tmp_path, caplog):
+    load_mjcf(written(tmp_path, urdf("".join(mesh(f"lost_{k}.stl") for k in range(7)))))
+    assert "lost_0.stl, lost_1.stl, lost_2.stl and 4 more." in caplog.text
 
 
 def test_a_mesh_that_is_too_large_is_refused_wherever_it_is_found(tmp_path):

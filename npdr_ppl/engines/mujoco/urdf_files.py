@@ -3,6 +3,7 @@
 import importlib
 import logging
 import os
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ _MOTOR = "_motor"
 
 _READABLE = (".stl", ".obj", ".msh")
 """Endings of the meshes that MuJoCo reads."""
+
+_MOST_NAMED = 3
+"""Missing meshes that a warning names. A robot without its meshes has one for each link."""
 
 
 def compiled_urdf(path: str | PathLike[str]) -> Any:
@@ -85,10 +89,19 @@ def _find_meshes(spec: Any, folder: Path) -> None:
         if mesh.name in missing:
             spec.delete(mesh)
     if missing:
-        names = ", ".join(sorted(set(missing.values())))
-        _LOGGER.warning(
-            "Links have no contacts where their mesh was not found or cannot be read: %s", names
-        )
+        _say_missing(folder, tuple(sorted(set(missing.values()))))
+
+
+@lru_cache
+def _say_missing(folder: Path, names: tuple[str, ...]) -> None:
+    """Warns of meshes that are left out, once in a process: a run reads the file many times."""
+    listed = ", ".join(names[:_MOST_NAMED])
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    _LOGGER.warning(
+        "Links have no contacts where their mesh was not found or cannot be read: %s%s.",
+        listed,
+        more,
+    )
 
 
 def _add_motors(spec: Any) -> None:
