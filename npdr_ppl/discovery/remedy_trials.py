@@ -40,14 +40,17 @@ class Windows:
         self.few: Windows | None = None
         self._places: list[tuple[int, int]] | None = None
         used, length = options.used_segments(rollouts), options.steps(rollouts)
-        layout = layout_of(rollouts, length)
+        layout, moving = layout_of(rollouts, length), motion(rollouts, length)
+
+        def some(num: int) -> Tensor:
+            return used[one_of_each_part(num, len(used), seed=0, weights=moving[used])]
+
         if len(used) > REPAIR.most_segments:
-            weights = motion(rollouts, length)[used]
-            used = used[one_of_each_part(REPAIR.most_segments, len(used), seed=0, weights=weights)]
+            used = some(REPAIR.most_segments)
             self._places = [layout[k][:2] for k in used.tolist()]
-        if len(used) >= REPAIR.part_of_first_trials * REPAIR.fewest_first:
+        if len(used) >= 2 * REPAIR.first_segments:
             self.few = copy.copy(self)
-            few = used[:: REPAIR.part_of_first_trials]
+            few = some(REPAIR.first_segments)
             self.few._places = [layout[k][:2] for k in few.tolist()]
 
     def fitted(
@@ -128,6 +131,8 @@ class RemedyTrials:
                 first = self._few.fitted(self._model, changed, start)
                 if first is None:
                     return math.inf
+                if isinstance(shift, Shift):
+                    known[shift.steps] = first.parameters
                 ratio = relative_misfit(misfits_of(first), self._present_in_few)
                 if ratio >= REPAIR.hopeless_ratio:
                     return ratio

@@ -188,6 +188,8 @@ def test_the_fit_of_a_shift_begins_at_that_of_the_nearest_shift(monkeypatch):
         return found
 
     kept = []
+    settings = dataclasses.replace(recording_repair.REPAIR, first_segments=100)
+    monkeypatch.setattr(remedy_trials, "REPAIR", settings)
     monkeypatch.setattr(remedy_trials.Windows, "fitted", fitted)
     rollouts = swinging(steps=240)
     windows = remedy_trials.Windows(rollouts, npdr.DataOptions(None, 30))
@@ -332,7 +334,7 @@ def test_of_a_long_recording_remedies_are_tried_along_the_same_segments(monkeypa
 
 
 def test_only_hopeful_remedies_are_tried_along_all_segments(monkeypatch):
-    settings = dataclasses.replace(recording_repair.REPAIR, most_segments=16, fewest_first=4)
+    settings = dataclasses.replace(recording_repair.REPAIR, most_segments=16, first_segments=4)
     monkeypatch.setattr(remedy_trials, "REPAIR", settings)
     rollouts = _ScaledAction("torque", -1.0)(turned(1.0, 1.0))
     windows = remedy_trials.Windows(rollouts, npdr.DataOptions(None, 20))
