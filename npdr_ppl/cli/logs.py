@@ -124,13 +124,15 @@ def inspect(
             text = mapping_to_start_from(found, settings, model=model, columns=columns)
             temporary.write_text(text, encoding="utf-8")
         if not as_json:
-            typer.echo(f"\nWrote {write}. Check its names and units, then:")
-            typer.echo(f"    npdr fit {model or 'MODEL'} --data {log} --mapping {write} --out fit")
-            if model:
-                missing = without_signal(found, columns)
-                if missing:
-                    typer.echo(_wrapped(f"No signal was found for {', '.join(missing)}."))
+            missing = without_signal(found, columns) if model else []
+            if missing:
+                typer.echo(f"\nWrote {write}.")
+                typer.echo(_wrapped(f"No signal was found for {', '.join(missing)}."))
+                typer.echo("Complete it, check its names and units, then:")
             else:
+                typer.echo(f"\nWrote {write}. Check its names and units, then:")
+            typer.echo(f"    npdr fit {model or 'MODEL'} --data {log} --mapping {write} --out fit")
+            if not model:
                 _print_lack_of_actions(found)
 
 
@@ -219,6 +221,8 @@ def _lines(found: "Description") -> Sequence[str]:
 
 
 def _timing_lines(timing: "Timing") -> list[str]:
+    from npdr_ppl.rollouts.logs.inspection import GAP
+
     if not math.isfinite(timing.step):
         return [f"{timing.count} samples"]
     lines = [
@@ -227,7 +231,7 @@ def _timing_lines(timing: "Timing") -> list[str]:
         f"  usual step {_duration(timing.step)}, 95 % of steps within "
         f"± {_duration(timing.jitter)}",
         f"  largest gap {_duration(timing.largest)} at {timing.largest_at:.6g} s"
-        + (f"; {timing.gaps} steps lack samples" if timing.gaps else ""),
+        + (f"; gaps of at least {GAP:g} steps: {timing.gaps}" if timing.gaps else ""),
     ]
     if timing.backwards:
         lines.append(f"  {timing.backwards} time stamps repeat or go back")

@@ -38,7 +38,7 @@ def test_inspect_shows_rates_gaps_and_ranges(monkeypatch, capsys, log):
     assert code == 0 and not err
     lines = out.splitlines()
     assert max(map(len, lines)) <= 80
-    assert "largest gap 120 ms at 1.99 s; 1 steps lack samples" in out
+    assert "largest gap 120 ms at 1.99 s; gaps of at least 2 steps: 1" in out
     assert "300 samples from 0 to 3.1 s, 100 Hz" in out and "50 Hz" in out
     (line,) = (line for line in lines if "arm/position" in line)
     assert line.split()[1:] == ["0", "…", "1", "position?"]

@@ -504,6 +504,7 @@ def test_divergence_costs_its_own_draw_only(caplog, tmp_path):
     draws = torch.tensor([0.2, -1e7, 0.3], dtype=torch.float64)
     for attached in ((), (Bias("shoulder_torque"),)):
         caplog.clear()
+        mujoco_open_loop._DIVERGED.clear()
         out = simulator.with_effects(*attached).simulate({"damping": draws}, inputs)
         alone = simulator.simulate({"damping": draws[[0, 2]]}, inputs)
         assert torch.equal(out[[0, 2]], alone)
@@ -511,6 +512,8 @@ def test_divergence_costs_its_own_draw_only(caplog, tmp_path):
         assert (out[1][~inputs.mask] == 0.0).all()
         assert len(caplog.records) == 1
         assert "diverged" in caplog.text
+        simulator.simulate({"damping": draws}, inputs)
+        assert len(caplog.records) == 1
     # The engine's own log would land in the user's folder.
     assert not list(tmp_path.iterdir())
 

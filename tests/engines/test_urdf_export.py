@@ -136,7 +136,6 @@ def test_effects_without_a_place_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "tool", "sentence"),
     [
-        ("armature", "", "no place for dof_armature"),
         ("upper", "", ""),
         ("inertia", HEAVY, "Link hand is welded to tool"),
     ],
@@ -148,6 +147,15 @@ def test_what_a_urdf_file_cannot_hold_is_said(tmp_path, name, tool, sentence):
         return
     with pytest.raises(ModelError, match=re.escape(sentence)):
         export_urdf(simulator, {name: value(0.0011)})
+
+
+def test_armatures_are_left_out_of_a_urdf_file_and_listed(tmp_path):
+    simulator = arm(tmp_path, "armature", "damping")
+    found = export_urdf(simulator, {"armature": value(0.0125), "damping": value(0.4)})
+    assert 'damping="0.4"' in found.text
+    ((name, reason),) = found.refused.items()
+    assert name.startswith("armature 0.0125 of ")
+    assert reason.startswith("a URDF file has no place for it")
 
 
 def test_an_mjcf_file_does_not_become_a_urdf_file(tmp_path):

@@ -39,7 +39,7 @@ class ExportedMjcf:
         text: The new text.
         callbacks: Python with the effects that MuJoCo does not have itself; ``None`` if there are
             none.
-        refused: Why other effects are in neither, by the effect's name.
+        refused: Why other effects, and armatures in a URDF file, are in neither, by name.
         needs_folder: Whether the text refers to other files, such as meshes, by relative paths.
     """
 

@@ -33,6 +33,9 @@ __all__ = ["CHUNK_BYTES", "replay"]
 
 logger = logging.getLogger(__name__)
 
+_DIVERGED: set[str] = set()
+"""Names of simulators of which a simulation has diverged in this process."""
+
 CHUNK_BYTES = 1 << 28
 """Bound, in bytes, on the memory for commands and records of simulations that run together."""
 
@@ -64,8 +67,13 @@ def replay(simulator: MujocoMechanism, parameters: Mapping[str, Tensor], inputs:
         output = torch.where(mask[..., None], output, torch.zeros_like(output))
     num_lost = int(output.isnan().flatten(-2).any(-1).sum())
     if num_lost:
-        logger.warning(
-            "%d of %d simulations of %s diverged; they are NaN from there on.",
+        # A search tries many parameters that do, and one warning says it.
+        level = logging.DEBUG if simulator.name in _DIVERGED else logging.WARNING
+        _DIVERGED.add(simulator.name)
+        logger.log(
+            level,
+            "%d of %d simulations of %s diverged; they are NaN from there on. Later ones are not "
+            "reported.",
             num_lost,
             size,
             simulator.name,

@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 _DYNAMICS = {"dof_damping": "damping", "dof_frictionloss": "friction"}
 """Attributes of <dynamics> by MuJoCo's arrays."""
 
+_ARMATURE = "dof_armature"
+
 _INERTIAL = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
 
 _ENTRIES = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2),
@@ -38,7 +40,7 @@ def export_urdf(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) ->
 
     A URDF file holds masses, centres of mass and inertias of links, and damping and dry friction
     of joints. All other text stays as it is. The result is loaded again and compared with the
-    model.
+    model. Armatures, for which it has no place, are left out and listed with their values.
 
     Args:
         simulator: The simulator, effects attached.
@@ -70,6 +72,12 @@ def export_urdf(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) ->
     assignments = file_assignments(
         chosen, {n: v for n, v in given.items() if n in own_names}, kept
     )
+    armatures = [place for array, place in assignments if array == _ARMATURE]
+    for dof in armatures:
+        joint = simulator.model.joint(int(simulator.model.dof_jntid[dof])).name
+        refused[f"armature {float(assignments.pop((_ARMATURE, dof))):.6g} of {joint}"] = (
+            "a URDF file has no place for it; set it in your simulator, or export an .xml file"
+        )
     text = _new_text(chosen, before, assignments, simulator.file.parent)
     name, folder = simulator.file.name, simulator.file.parent
     return ExportedMjcf(name, folder, before, text, None, refused, needs_folder)
