@@ -25,6 +25,7 @@ from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.parameter_units import parameter_units
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.posterior.prepare import prepare
+from npdr_ppl.posterior.run_folder import ASKED, begin_fit
 from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
@@ -62,8 +63,8 @@ def fit(
         train: Rollouts to fit.
         test: Held-out rollouts to report on; the fitted ones if ``None``.
         out: Folder for ``posterior.nc``, ``fit.json`` and the run itself, from which an
-            interrupted fit continues; until its end, the search for the closest parameters is
-            kept there, too. Nothing is written if ``None``.
+            interrupted fit continues, and which refuses another one; until its end, the search
+            for the closest parameters is kept there, too. Nothing is written if ``None``.
         backend: The inference backend.
         rounds: Rounds of simulating and training.
         extra_rounds: Rounds that the diagnosis may add where the estimator has not converged.
@@ -78,7 +79,11 @@ def fit(
     """
     fits = None if out is None else out / FITS
     was_there = out is not None and out.exists()
+    method = backend_by_name(backend) if isinstance(backend, str) else backend
     with reporter(progress) as report, claimed(out):
+        is_new = out is not None and begin_fit(
+            out, model, train, method, options, seed, num_simulations
+        )
         try:
             with collect_faults() as before, keep_fits(fits, code_checksum(model)):
                 prepared = prepare(
@@ -89,9 +94,12 @@ def fit(
                     progress=report.stage("find the closest parameters"),
                 )
         except NpdrError:
-            # A recording that does not fit the model leaves no folder; finished fits stay.
-            if out is not None and not was_there and not (out / FITS).exists():
-                shutil.rmtree(out, ignore_errors=True)
+            # A recording that does not fit the model leaves nothing; finished fits stay.
+            if out is not None and not (out / FITS).exists():
+                if not was_there:
+                    shutil.rmtree(out, ignore_errors=True)
+                elif is_new:
+                    (out / ASKED).unlink(missing_ok=True)
             raise
         options = prepared.options
         started = time.perf_counter()
@@ -99,7 +107,6 @@ def fit(
             folder = (
                 stack.enter_context(TemporaryDirectory(prefix="npdr-")) if out is None else out
             )
-            method = backend_by_name(backend) if isinstance(backend, str) else backend
             left = extra_rounds if method.is_sequential else 0
             while True:
                 posterior = infer(

@@ -9,6 +9,8 @@
     round_<r>_simulations.safetensors   parameters z and features x of a round
     round_<r>.safetensors, round_<r>.json   the backend's state after that round
 
+Beside it, ``asked.json`` has what a fit was asked for: another fit is refused at once.
+
 Every file replaces its predecessor in one step, so a run killed at any moment leaves a folder that
 :func:`npdr_ppl.infer` continues from.
 """
@@ -31,12 +33,14 @@ from npdr_ppl.language.handlers import (
     with_finer_steps,
     with_noise,
 )
+from npdr_ppl.language.model import Model
 from npdr_ppl.language.prior import Prior
 from npdr_ppl.model_code import code_checksum
 from npdr_ppl.model_identity import engine_settings, model_name, source_text, versions
 from npdr_ppl.posterior.estimator_check import Correction
 from npdr_ppl.posterior.prepare import Preparation
 from npdr_ppl.preparation.binding import BoundModel
+from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.initial_states import InitialStates
 from npdr_ppl.rollouts import Rollouts
 from npdr_ppl.rollouts.collection import checksum
@@ -51,7 +55,10 @@ from npdr_ppl.run_files import (
 )
 from npdr_ppl.run_records import PreparationRecord, RoundRecord, RunDescription
 
-__all__ = ["RunFolder", "SavedPreparation", "SavedRound"]
+__all__ = ["ASKED", "RunFolder", "SavedPreparation", "SavedRound", "begin_fit"]
+
+ASKED = "asked.json"
+"""Name of the file, beside the run's folder, with what a fit was asked for."""
 
 FORMAT = 1
 
@@ -119,7 +126,7 @@ class RunFolder:
             "format": FORMAT,
             "backend": method.name,
             "options": dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {},
-            "binding": _binding(bound),
+            "binding": _binding(bound.options),
             "seed": seed,
             "num_simulations": num_simulations,
             "code": code_checksum(bound.model),
@@ -280,9 +287,45 @@ class RunFolder:
         return self.path / f"round_{index}_simulations.safetensors"
 
 
-def _binding(bound: BoundModel) -> dict[str, Any]:
-    values = dataclasses.asdict(bound.options)
-    embedding = bound.options.embedding
+def begin_fit(
+    path: Path,
+    model: Model,
+    rollouts: Rollouts,
+    method: Backend,
+    options: DataOptions | None,
+    seed: int,
+    num_simulations: int,
+) -> bool:
+    """Writes what a fit is asked for, or checks that its folder holds this very fit.
+
+    :meth:`RunFolder.begin` needs the prepared recording; until that is known, the fits of another
+    recording would have been mixed with those of the folder.
+
+    Returns:
+        Whether it was written.
+
+    Raises:
+        DataError: The folder holds a fit with other settings or data.
+    """
+    make_folder(path)
+    description = {
+        "backend": method.name,
+        "binding": _binding(checked_options(options)),
+        "seed": seed,
+        "num_simulations": num_simulations,
+        "code": code_checksum(model),
+        "fingerprint": _fingerprint({"rollouts": rollouts}),
+    }
+    file = path / ASKED
+    if holds_this_run(file, description):
+        return False
+    write_json(file, description)
+    return True
+
+
+def _binding(options: DataOptions) -> dict[str, Any]:
+    values = dataclasses.asdict(options)
+    embedding = options.embedding
     values["embedding"] = embedding if isinstance(embedding, str | None) else repr(embedding)
     return values
 

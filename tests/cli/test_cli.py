@@ -127,6 +127,8 @@ def test_fit_takes_a_models_file_and_effects(monkeypatch, capsys, tmp_path, reco
     assert sys.modules["json"] is json
     # Results of a model are not shown as those of a corrected one.
     file.write_text(file.read_text().replace("'mass': mass", "'mass': 2.0 * mass"))
+    module = sys.modules["npdr_ppl.posterior.fit"]
+    monkeypatch.setattr(module, "prepare", lambda *_, **__: pytest.fail("not refused at once"))
     code, _, err = run(
         monkeypatch, capsys, "fit", f"{file}:heavy", "--data", recording, "--out", out,
         "--effect", "hinge.coulomb_friction", "--rounds", 1, "--simulations", 100, "--quiet",
