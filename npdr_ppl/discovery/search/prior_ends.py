@@ -63,6 +63,15 @@ class PriorEnd:
             f"the {self.end} end of its prior, {self.prior}: widen the prior"
         )
 
+    @property
+    def decisive(self) -> str:
+        """A sentence for a fit that stays in the prior, because a wider one was not needed."""
+        return (
+            f"{self.name} is at the {self.end} end of its prior, {self.prior}. So the prior, and "
+            "not the recording, may decide it and what trades with it: widen it if the robot "
+            "allows."
+        )
+
 
 @dataclass(frozen=True)
 class Widened:
