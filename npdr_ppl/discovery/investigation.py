@@ -206,13 +206,6 @@ class Investigation:
         return beyond(self._start[1], final)
 
     @cached_property
-    def decisive_priors(self) -> tuple[PriorEnd, ...]:
-        """The original priors at whose ends the final fit is, although they suffice."""
-        if self._searcher.are_priors_widened:
-            return ()
-        return beyond(self._start[1], self.search.final)
-
-    @cached_property
     def where(self) -> list[Spot]:
         """The windows in which the original model fits worst, the worst first."""
         return worst_windows(self.start, self.rollouts)
@@ -355,7 +348,8 @@ class Investigation:
         reason = found.reason
         if self.narrow_priors:
             reason = f"{'. '.join(map(str, self.narrow_priors))}. With wider priors: {reason}"
-        reason = " ".join((reason, *(end.decisive for end in self.decisive_priors)))
+        elif ends := beyond(self._start[1], final):
+            reason = " ".join((reason, *(end.decisive for end in ends)))
         if self._searcher.are_steps_coarse:
             reason = f"{reason} {COARSE}"
         with self.progress.timed("next experiment"):

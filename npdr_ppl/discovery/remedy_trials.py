@@ -21,7 +21,7 @@ from npdr_ppl.models.effects.candidates import attached
 from npdr_ppl.preparation.data_options import DataOptions, one_of_each_part
 from npdr_ppl.preparation.segment_model import SegmentModel
 from npdr_ppl.rollouts import Rollouts
-from npdr_ppl.rollouts.segments import layout_of, motion
+from npdr_ppl.rollouts.segments import layout_of, motion_by_channel
 
 __all__ = ["RemedyTrials", "Windows", "misfits_of", "relative_misfit", "root_mean_square"]
 
@@ -40,18 +40,23 @@ class Windows:
         self.few: Windows | None = None
         self._places: list[tuple[int, int]] | None = None
         used, length = options.used_segments(rollouts), options.steps(rollouts)
-        layout, moving = layout_of(rollouts, length), motion(rollouts, length)
+        layout, moving = layout_of(rollouts, length), motion_by_channel(rollouts, length)
 
         def some(num: int) -> Tensor:
-            return used[one_of_each_part(num, len(used), seed=0, weights=moving[used])]
+            return used[one_of_each_part(num, len(used), seed=0, weights=moving[used].sum(-1))]
 
         if len(used) > REPAIR.most_segments:
             used = some(REPAIR.most_segments)
             self._places = [layout[k][:2] for k in used.tolist()]
         if len(used) >= 2 * REPAIR.first_segments:
             self.few = copy.copy(self)
-            few = some(REPAIR.first_segments)
-            self.few._places = [layout[k][:2] for k in few.tolist()]
+            few = set(some(REPAIR.first_segments).tolist())
+            for own in moving.T:
+                # A channel that hardly moves in them would show neither a unit nor a sign.
+                largest = int(used[own[used].argmax()])
+                if own[[*few]].max() < 0.5 * own[largest]:
+                    few.add(largest)
+            self.few._places = [layout[k][:2] for k in sorted(few)]
 
     def fitted(
         self, model: Model, rollouts: Rollouts, start: Mapping[str, Tensor] | None = None
@@ -131,8 +136,6 @@ class RemedyTrials:
                 first = self._few.fitted(self._model, changed, start)
                 if first is None:
                     return math.inf
-                if isinstance(shift, Shift):
-                    known[shift.steps] = first.parameters
                 ratio = relative_misfit(misfits_of(first), self._present_in_few)
                 if ratio >= REPAIR.hopeless_ratio:
                     return ratio
@@ -198,10 +201,10 @@ def misfits_of(hypothesis: Hypothesis) -> dict[str, float]:
     Residuals up to it are no misfit, and a channel that changes by less shows no unit and no sign:
     its ratio is 0. An idle gripper would otherwise make every recording of its arm look wrong.
     """
-    segments, fit = hypothesis.segments, hypothesis.fit
+    segments = hypothesis.segments
     names = segments.inputs.channel_names
     columns = [names.index(name) for name in segments.channel_names]
-    residual = segments.observed - segments.simulate(fit.z[None], fit.offsets[None])[0]
+    residual = hypothesis.difference
     change = segments.observed - segments.inputs.initial_values[:, None, columns]
     measured = segments.is_measured.expand(residual.shape)
     resolution = residual.new_tensor(

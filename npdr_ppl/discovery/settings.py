@@ -30,8 +30,8 @@ class RepairSettings:
         most_segments: Greatest number of segments along which remedies are tried. A unit, a sign
             or a clock is wrong in the whole recording. With the default length they last 40 s.
         first_segments: Segments along which a remedy is first tried, if there are at least twice
-            as many. They move: a unit or a sign shows in any of them. An arm of five joints has 82
-            remedies, and their trials along 39 segments took 170 s.
+            as many; further ones for channels that hardly move in these. An arm of five joints has
+            82 remedies, and their trials along 39 segments took 170 s.
         hopeless_ratio: Residual of this trial, relative to that of the recording as it was read,
             from which the remedy is not tried along all of them. It is above ``remedy_factor``, so
             that a remedy is not missed because its residual differs between the segments.

@@ -53,11 +53,11 @@ def judge(
     strained = [f for f in effects if f.at_edge and f.share > VERDICT.minor_share * explains]
     if strained:
         effect = strained[0].effect
-        simpler = " and ".join(effect.contains)
+        simpler = " or ".join(f"{effect.port}.{law}" for law in effect.contains)
         return "unknown", (
             f"{effect.name} explains the misfit with an implausible value of "
-            f"{strained[0].at_edge[0]}. Another law that is similar there is the likelier cause"
-            + (f", such as one close to {simpler}." if simpler else ".")
+            f"{strained[0].at_edge[0]}. Another law that is similar there is the likelier cause."
+            + (f" Compare it with {simpler}." if simpler else "")
         )
     once = [(f, f.repetition) for f in effects if f.repetition and not f.is_found_again]
     if once:

@@ -25,7 +25,7 @@ from npdr_ppl.posterior.infer import infer
 from npdr_ppl.posterior.parameter_units import parameter_units
 from npdr_ppl.posterior.posterior import Posterior
 from npdr_ppl.posterior.prepare import prepare
-from npdr_ppl.posterior.run_folder import ASKED, begin_fit
+from npdr_ppl.posterior.run_folder import ASKED, RUN, begin_fit
 from npdr_ppl.preparation.data_options import DataOptions, checked_options
 from npdr_ppl.preparation.evaluation import score
 from npdr_ppl.progress import Reporter, reporter
@@ -81,9 +81,8 @@ def fit(
     was_there = out is not None and out.exists()
     method = backend_by_name(backend) if isinstance(backend, str) else backend
     with reporter(progress) as report, claimed(out):
-        is_new = out is not None and begin_fit(
-            out, model, train, method, options, seed, num_simulations
-        )
+        if out is not None and isinstance(train, Rollouts):
+            begin_fit(out, model, train, method, options, seed, num_simulations)
         try:
             with collect_faults() as before, keep_fits(fits, code_checksum(model)):
                 prepared = prepare(
@@ -98,7 +97,7 @@ def fit(
             if out is not None and not (out / FITS).exists():
                 if not was_there:
                     shutil.rmtree(out, ignore_errors=True)
-                elif is_new:
+                elif not (out / RUN).exists():
                     (out / ASKED).unlink(missing_ok=True)
             raise
         options = prepared.options
@@ -119,7 +118,7 @@ def fit(
                     preparation=prepared,
                     start=prepared.neighbourhood(),
                     device=device,
-                    checkpoint=Path(folder) / "run",
+                    checkpoint=Path(folder) / RUN,
                     progress=report,
                 )
                 step = report.stage("sample and judge")

@@ -55,10 +55,10 @@ from npdr_ppl.run_files import (
 )
 from npdr_ppl.run_records import PreparationRecord, RoundRecord, RunDescription
 
-__all__ = ["ASKED", "RunFolder", "SavedPreparation", "SavedRound", "begin_fit"]
+__all__ = ["ASKED", "RUN", "RunFolder", "SavedPreparation", "SavedRound", "begin_fit"]
 
-ASKED = "asked.json"
-"""Name of the file, beside the run's folder, with what a fit was asked for."""
+ASKED, RUN = "asked.json", "run"
+"""Names, in the folder of a fit, of the file with what was asked for, and of the run's folder."""
 
 FORMAT = 1
 
@@ -295,32 +295,28 @@ def begin_fit(
     options: DataOptions | None,
     seed: int,
     num_simulations: int,
-) -> bool:
-    """Writes what a fit is asked for, or checks that its folder holds this very fit.
+) -> None:
+    """Writes what a fit is asked for, or checks that the run in its folder is asked for the same.
 
-    :meth:`RunFolder.begin` needs the prepared recording; until that is known, the fits of another
-    recording would have been mixed with those of the folder.
-
-    Returns:
-        Whether it was written.
+    :meth:`RunFolder.begin` can check only after the preparation, which may take most of the time.
+    A folder without a run is free for any fit; one of an earlier version is left to that check.
 
     Raises:
-        DataError: The folder holds a fit with other settings or data.
+        DataError: The folder holds a run with other settings or data.
     """
-    make_folder(path)
     description = {
         "backend": method.name,
+        "options": dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {},
         "binding": _binding(checked_options(options)),
         "seed": seed,
         "num_simulations": num_simulations,
         "code": code_checksum(model),
         "fingerprint": _fingerprint({"rollouts": rollouts}),
     }
-    file = path / ASKED
-    if holds_this_run(file, description):
-        return False
-    write_json(file, description)
-    return True
+    if not (path / RUN / "run.json").exists():
+        write_json(path / ASKED, description)
+    elif (path / ASKED).exists():
+        holds_this_run(path / ASKED, description)
 
 
 def _binding(options: DataOptions) -> dict[str, Any]:

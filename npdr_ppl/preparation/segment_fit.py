@@ -29,6 +29,9 @@ from npdr_ppl.preparation.solving import solve_or_zero
 
 __all__ = ["SegmentFit", "fit_segments"]
 
+MOST_KEPT = 1 << 23
+"""Differences of trials that are kept until one is accepted, to bound memory: 64 MB."""
+
 _Place = tuple[SegmentModel, Linearisation]
 """A model that is like the fitted one near a point, and its linearisation there."""
 
@@ -53,17 +56,6 @@ class SegmentFit:
     scale: Tensor
     linearisation: Linearisation | None = None
     difference: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class _End:
-    """Where steps have ended; see :class:`SegmentFit`."""
-
-    z: Tensor
-    offsets: Tensor
-    scale: Tensor
-    linearisation: Linearisation | None
-    difference: Tensor | None
 
 
 def fit_segments(
@@ -109,21 +101,36 @@ def fit_segments(
     first = model, now
     if scale is not None:
         end = _steps(segments, z, offsets, begun, held, max_steps, is_rough=False, first=first)
-        return SegmentFit(end.z, end.offsets, begun, difference=end.difference)
+        return replace(end, scale=begun, linearisation=None)
     present = _scale(segments, _by_channel(now.residual, unit), unit)
     first = model, now.rescaled(unit / present)
     end = _steps(segments, z, offsets, present, held, max_steps, is_rough=True, first=first)
     if is_rough:
-        return SegmentFit(end.z, end.offsets, end.scale, difference=end.difference)
+        return replace(end, linearisation=None)
     first = segments.corrected(end.z, end.offsets, end.scale)
     share = segments.effective_share(first[1].residual)
 
-    def precise(z: Tensor, offsets: Tensor, scale: Tensor, first: _Place | None = None) -> _End:
+    def precise(
+        z: Tensor,
+        offsets: Tensor,
+        scale: Tensor,
+        first: _Place | None = None,
+        difference: Tensor | None = None,
+    ) -> SegmentFit:
         return _steps(
-            segments, z, offsets, scale, held, max_steps, is_rough=False, share=share, first=first
+            segments,
+            z,
+            offsets,
+            scale,
+            held,
+            max_steps,
+            is_rough=False,
+            share=share,
+            first=first,
+            difference=difference,
         )
 
-    end = precise(end.z, end.offsets, end.scale, first)
+    end = precise(end.z, end.offsets, end.scale, first, end.difference)
     unstuck = _unstuck_offsets(segments, end)
     if unstuck is not None:
         end = precise(end.z, unstuck, end.scale)
@@ -132,11 +139,10 @@ def fit_segments(
         if better is None:
             break
         end = precise(*better, end.scale)
-    last = None if bool(held.any()) else end.linearisation
-    return SegmentFit(end.z, end.offsets, end.scale, last, end.difference)
+    return replace(end, linearisation=None) if bool(held.any()) else end
 
 
-def _unstuck_offsets(segments: SegmentModel, end: _End) -> Tensor | None:
+def _unstuck_offsets(segments: SegmentModel, end: SegmentFit) -> Tensor | None:
     """Returns offsets from which badly fitted segments can improve; ``None`` if there are none.
 
     Where dry friction holds a joint, the simulation does not depend on the segment's initial rate,
@@ -235,7 +241,8 @@ def _steps(
     is_rough: bool,
     share: float = 1.0,
     first: _Place | None = None,
-) -> _End:
+    difference: Tensor | None = None,
+) -> SegmentFit:
     """Takes steps until they gain little.
 
     Where the simulator has coarser steps, each linearisation and the trials after it take those,
@@ -261,6 +268,7 @@ def _steps(
         share: Effective number of measurements as a share of all; the fewer, the less log evidence
             is in a gain.
         first: :meth:`SegmentModel.corrected` at the first point, if it is known.
+        difference: Measurement minus simulation at the first point, if it is known.
 
     Returns:
         The end, whose scale is that of the residuals there.
@@ -274,7 +282,6 @@ def _steps(
     uniform = segments.prior.uniform_coordinates
     now, model, num_updates, num_linearised = None, segments, 0, 0
     known: tuple[Tensor, Tensor, Tensor, Linearisation] | None = None
-    difference: Tensor | None = None
     found: tuple[float, Tensor, Tensor, Tensor] | None = None
     most_updates = 0 if has_minima else _most_updates(segments, held, is_rough=is_rough)
     while True:
@@ -315,8 +322,7 @@ def _steps(
         ]
         tried = torch.stack([point for point, _ in moves])
         begun = torch.stack([starts for _, starts in moves])  # (a, b, S, m)
-        differences = _differences(model, tried, begun)  # (a, b, S, K, C)
-        squares = _sums_of_squares(model, differences, scale)  # (a, b, S, C)
+        squares, differences = _tried(model, tried, begun, scale)  # (a, b, S, C)
         losses = (squares.sum(-1) + begun.square().sum(-1)).nan_to_num(torch.inf)
         least, chosen = losses.min(1)  # (a, S)
         outcome = least.sum(-1) + tried.square().sum(-1)
@@ -324,7 +330,7 @@ def _steps(
         gain = present - float(outcome[best])
         is_little = gain < enough
         place, every = chosen[best], torch.arange(len(offsets))
-        at_best = differences[best][place, every]
+        at_best = None if differences is None else differences[best][place, every]
         del differences  # large for a long recording
         if gain > 0.0:
             last = z, offsets
@@ -345,6 +351,8 @@ def _steps(
                 is_little = is_little and bool((scale > SEGMENT_FIT.settled_scale * before).all())
             corrected = None
             if most_updates:
+                if at_best is None:
+                    at_best = model.difference(z[None], offsets[None])[0]
                 followed, change = as_moved(now, last[0], z, uniform)
                 corrected = followed.rescaled(before / scale).updated(
                     model.whitened(at_best, scale), change, offsets - last[1]
@@ -368,7 +376,7 @@ def _steps(
     last = None
     if known is not None and known[0] is z and known[1] is offsets:
         last = known[3].rescaled(known[2] / present_scale)
-    return _End(z, offsets, present_scale, last, difference)
+    return SegmentFit(z, offsets, present_scale, last, difference)
 
 
 def _by_channel(residual: Tensor, scale: Tensor) -> Tensor:
@@ -411,12 +419,19 @@ def _squares(segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor) 
     ).unflatten(0, offsets.shape[:2])
 
 
-def _differences(segments: SegmentModel, z: Tensor, offsets: Tensor) -> Tensor:
-    """Returns measurements minus simulations, ``(a, b, S, K, C)``; see :func:`_squares`."""
+def _tried(
+    segments: SegmentModel, z: Tensor, offsets: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor | None]:
+    """Returns :func:`_squares`, and measurements minus simulations, ``(a, b, S, K, C)``.
+
+    The latter are ``None`` if there are more than :data:`MOST_KEPT`.
+    """
+    if offsets.shape[:2].numel() * segments.observed.numel() > MOST_KEPT:
+        return _squares(segments, z, offsets, scale), None
     parts = [*_in_chunks(segments, z, offsets)]
-    # Of a long recording every copy takes a hundred megabytes.
-    found = parts[0] if len(parts) == 1 else torch.cat(parts)
-    return found.unflatten(0, offsets.shape[:2])
+    squares = torch.cat([_sums_of_squares(segments, part, scale) for part in parts])
+    shape = offsets.shape[:2]
+    return squares.unflatten(0, shape), torch.cat(parts).unflatten(0, shape)
 
 
 def _in_chunks(segments: SegmentModel, z: Tensor, offsets: Tensor) -> Iterator[Tensor]:

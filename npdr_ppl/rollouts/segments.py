@@ -24,6 +24,7 @@ __all__ = [
     "inputs",
     "layout_of",
     "motion",
+    "motion_by_channel",
     "observation",
     "stitch",
 ]
@@ -306,8 +307,16 @@ def layout_of(rollouts: Recording, segment_length: int | None) -> list[tuple[int
 def motion(rollouts: Recording, segment_length: int | None) -> torch.Tensor:
     """Returns how much each segment moves, ``(S,)``; see :func:`layout_of`.
 
+    It is :func:`motion_by_channel`, summed over the channels.
+    """
+    return motion_by_channel(rollouts, segment_length).sum(-1)
+
+
+def motion_by_channel(rollouts: Recording, segment_length: int | None) -> torch.Tensor:
+    """Returns how much each channel moves in each segment, ``(S, C)``; see :func:`layout_of`.
+
     It is the distance between the quartiles of a channel in the segment, which single wrong
-    readings do not change, relative to the channel's standard deviation, summed over the channels.
+    readings do not change, relative to the channel's standard deviation.
     """
     found = []
     with warnings.catch_warnings():
@@ -317,8 +326,8 @@ def motion(rollouts: Recording, segment_length: int | None) -> torch.Tensor:
         for rollout, start, end in layout_of(rollouts, segment_length):
             readings = rollouts.readings[rollout][start : end + 1]
             low, high = np.nanquantile(readings, [0.25, 0.75], axis=0)
-            found.append(np.nansum((high - low) / np.where(spread > 0.0, spread, np.inf)))
-    return torch.tensor(found, dtype=torch.float64)
+            found.append(np.nan_to_num((high - low) / np.where(spread > 0.0, spread, np.inf)))
+    return torch.tensor(np.array(found), dtype=torch.float64)
 
 
 def _estimated(rollouts: Recording, layout: Sequence[tuple[int, int, int]]) -> StateEstimate:

@@ -154,7 +154,7 @@ def test_armatures_are_left_out_of_a_urdf_file_and_listed(tmp_path):
     found = export_urdf(simulator, {"armature": value(0.0125), "damping": value(0.4)})
     assert 'damping="0.4"' in found.text
     ((name, reason),) = found.refused.items()
-    assert name.startswith("armature 0.0125 of ")
+    assert name.startswith("armature of ") and ", 0.0125 kg m²" in name
     assert reason.startswith("a URDF file has no place for it")
 
 

@@ -1,5 +1,7 @@
 """infer and Posterior: the right answer, the same answer again, and after a restart."""
 
+import json
+
 import numpy as np
 import pyro
 import pyro.distributions as dist
@@ -9,9 +11,12 @@ from pyro.infer import Predictive
 
 import npdr_ppl as npdr
 from npdr_ppl.errors import BackendError, DataError, ModelError, ShapeError
+from npdr_ppl.inference.registry import backend
 from npdr_ppl.models.pendulum import pendulum
 from npdr_ppl.posterior import infer as infer_module
+from npdr_ppl.posterior.run_folder import begin_fit
 from npdr_ppl.preparation.binding import BoundModel
+from tests.helpers.pendulum_recordings import swinging
 
 
 @pytest.mark.slow
@@ -312,3 +317,20 @@ def test_data_in_degrees_are_converted_and_recordings_added_twice_are_used_once(
     assert twice.rollouts.spans[1] == () and "identical to rollout 0" in twice.rollouts.notes[0]
     with pytest.raises(DataError, match="identical"):
         prepare(pendulum, recording[[0, 0]], strict)
+
+
+def test_a_folder_without_a_run_is_free_for_any_fit(tmp_path):
+    recording = swinging()
+    asked = tmp_path / "asked.json"
+    for seed in (0, 1):
+        begin_fit(tmp_path, pendulum, recording, backend("snpe-c"), None, seed, 100)
+        assert json.loads(asked.read_text())["seed"] == seed
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    begin_fit(tmp_path, pendulum, recording, backend("snpe-c"), None, 1, 100)
+    with pytest.raises(DataError, match="differs in seed"):
+        begin_fit(tmp_path, pendulum, recording, backend("snpe-c"), None, 0, 100)
+    # A run of an earlier version has a check of its own, later.
+    asked.unlink()
+    begin_fit(tmp_path, pendulum, recording, backend("snpe-c"), None, 0, 100)
+    assert not asked.exists()

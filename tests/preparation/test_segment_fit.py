@@ -446,3 +446,17 @@ def test_the_possible_gain_is_the_greatest_that_a_linear_model_allows():
     expected = float(target.square().sum() - left.square().sum())
     gain = gauss_newton.possible_gain(now, z, offsets, held, torch.zeros_like(held))
     assert gain == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("is_rough", [True, False])
+@pytest.mark.parametrize("most_kept", [segment_fit.MOST_KEPT, 0])
+def test_the_difference_of_a_fit_is_that_of_its_simulation(
+    segments, monkeypatch, is_rough, most_kept
+):
+    monkeypatch.setattr(segment_fit, "MOST_KEPT", most_kept)
+    found = fit_segments(segments, START, is_rough=is_rough)
+    if most_kept:
+        simulated = segments.difference(found.z[None], found.offsets[None])[0]
+        torch.testing.assert_close(found.difference, simulated, rtol=0.0, atol=1e-12)
+    else:
+        assert found.difference is None

@@ -5,8 +5,8 @@ only tried at a few rest positions, a wrong stiffness would go with each of them
 begins there could end as a constant force. So such a shape is solved for.
 
 Other shapes are tried at many places of their priors, from the responses to pulses and without
-any simulation. Wind has a direction and a speed: tried at a few of each, that at the arm of the
-Furuta pendulum of seed 1160 had a twentieth of its gain, and an unbalance was found in its place.
+any simulation. Wind has a direction and a speed. With few of each, wind at the arm of the Furuta
+pendulum of seed 1160 had a twentieth of its gain, and an unbalance was found in its place.
 """
 
 import math
@@ -92,7 +92,7 @@ def _solved(
 def _tried(
     projection: Projection, found: Responses, effect: ForceEffect, names: list[str]
 ) -> dict[str, float]:
-    """Returns the best of many shapes of a law with one strength and without memory."""
+    """Returns the best of many shapes of a law in proportion to one strength, without memory."""
     kind, rates = type(effect), _rates(projection, found, effect)
     is_plain = kind.initial_memory is ForceEffect.initial_memory and not effect.needs_joint
     has_dry = kind.dry_friction is not ForceEffect.dry_friction
@@ -122,7 +122,10 @@ def _tried(
 
 
 def _rates(projection: Projection, found: Responses, effect: Effect) -> Tensor | None:
-    """Returns the velocities of a joint at the pulses, ``(S, P)``; ``None`` if it never moves."""
+    """Returns the velocities of a joint at the pulses, ``(S, P)``.
+
+    ``None`` if there is one pulse per segment only, and the velocity is not measured.
+    """
     position = found.positions[effect.port]
     for sensor in projection.hypothesis.segments.measured:
         if sensor.rate_of == position:

@@ -98,7 +98,7 @@ def variants_of(
             step = strongest_rounding(projection, found, port.name, port.joint, largest)
             if step is not None:
                 hints[effect.name] = {effect.rounds: step}
-        elif shape := force_shape(projection, found, effect):
+        elif effect.name not in hints and (shape := force_shape(projection, found, effect)):
             hints[effect.name] = shape
     candidates, numbered = _with_ripples(candidates, projection, found)
     for variant in _in_all_shapes(projection, candidates, hints, number):

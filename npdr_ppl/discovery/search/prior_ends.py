@@ -43,13 +43,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class PriorEnd:
-    """A parameter that fits better beyond the end of its prior.
+    """A parameter whose fit is at or beyond an end of its prior.
 
     Attributes:
         name: Its latent site.
         end: ``"lower"`` or ``"upper"``.
         prior: The prior in readable form.
-        closest: The value of the fit with a wider prior, in the parameter's unit.
+        closest: The value of the fit, in the parameter's unit.
     """
 
     name: str
@@ -67,9 +67,9 @@ class PriorEnd:
     def decisive(self) -> str:
         """A sentence for a fit that stays in the prior, because a wider one was not needed."""
         return (
-            f"{self.name} is at the {self.end} end of its prior, {self.prior}. So the prior, and "
-            "not the recording, may decide it and what trades with it: widen it if the robot "
-            "allows."
+            f"{self.name} is at the {self.end} end of its prior, {self.prior}. The prior, and not "
+            "the recording, may therefore determine it and the parameters that compensate for it. "
+            "Widen the prior if the robot can have such a value."
         )
 
 

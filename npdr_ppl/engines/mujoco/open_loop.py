@@ -33,8 +33,8 @@ __all__ = ["CHUNK_BYTES", "replay"]
 
 logger = logging.getLogger(__name__)
 
-_DIVERGED: set[str] = set()
-"""Names of simulators of which a simulation has diverged in this process."""
+_DIVERGED: set[int] = set()
+"""Hashes of robots' files of which a simulation has diverged in this process."""
 
 CHUNK_BYTES = 1 << 28
 """Bound, in bytes, on the memory for commands and records of simulations that run together."""
@@ -68,15 +68,16 @@ def replay(simulator: MujocoMechanism, parameters: Mapping[str, Tensor], inputs:
     num_lost = int(output.isnan().flatten(-2).any(-1).sum())
     if num_lost:
         # A search tries many parameters that do, and one warning says it.
-        level = logging.DEBUG if simulator.name in _DIVERGED else logging.WARNING
-        _DIVERGED.add(simulator.name)
+        source = hash(str(simulator._source))
+        is_said = source in _DIVERGED
+        _DIVERGED.add(source)
         logger.log(
-            level,
-            "%d of %d simulations of %s diverged; they are NaN from there on. Later ones are not "
-            "reported.",
+            logging.DEBUG if is_said else logging.WARNING,
+            "%d of %d simulations of %s diverged; they are NaN from there on.%s",
             num_lost,
             size,
             simulator.name,
+            "" if is_said else " Those that follow are not reported.",
         )
     return output
 

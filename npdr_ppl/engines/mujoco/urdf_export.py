@@ -75,7 +75,8 @@ def export_urdf(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) ->
     armatures = [place for array, place in assignments if array == _ARMATURE]
     for dof in armatures:
         joint = simulator.model.joint(int(simulator.model.dof_jntid[dof])).name
-        refused[f"armature {float(assignments.pop((_ARMATURE, dof))):.6g} of {joint}"] = (
+        value = float(assignments.pop((_ARMATURE, dof)))
+        refused[f"armature of {joint}, {value:.6g} kg m² (kg for a slide)"] = (
             "a URDF file has no place for it; set it in your simulator, or export an .xml file"
         )
     text = _new_text(chosen, before, assignments, simulator.file.parent)
