@@ -100,16 +100,20 @@ def _tried(
         return {}
     position = found.channels[found.positions[effect.port]]
     priors = effect.priors(projection.hypothesis.simulator.port(effect.port))
-    places = torch.quasirandom.SobolEngine(len(names), scramble=True, seed=0).draw(_NUM_TRIED)
-    places = _TAIL + (1.0 - 2.0 * _TAIL) * places.double()
-    shapes = {name: quantile(priors[name], places[:, k]) for k, name in enumerate(names)}
+    points = torch.quasirandom.SobolEngine(len(names), scramble=True, seed=0).draw(_NUM_TRIED)
+    points = _TAIL + (1.0 - 2.0 * _TAIL) * points.double()
+    shapes = {name: quantile(priors[name], points[:, k]) for k, name in enumerate(names)}
     strength = effect.strengths[0].name
+    # Engines pass laws one value per simulation of each argument.
+    size = torch.Size((*position.shape, _NUM_TRIED))
+    where, moving = (part[..., None].expand(size).flatten() for part in (position, rates))
+    values = {name: value.expand(size).flatten() for name, value in shapes.items()}
     law = effect.force(
-        position[..., None], rates[..., None], {**shapes, strength: torch.tensor(1.0)}, None
+        where, moving, {**values, strength: torch.ones(size.numel()).double()}, None
     )
     if law is None:
         return {}
-    scores = PulseChanges(projection, found.by_port[effect.port]).scores(law)
+    scores = PulseChanges(projection, found.by_port[effect.port]).scores(law.reshape(size))
     information = scores.information.diagonal()
     sizes, support = scores.score / information.clamp_min(1e-300), priors[strength].support
     gains = torch.where(information > _LEAST_LEFT * scores.total, scores.score * sizes, -math.inf)
