@@ -80,11 +80,13 @@ def check_channels(
     known = recorded | {channel.name for channel in channels}
     missing += [c.name for c in channels if c.name not in recorded and c.rate_of not in known]
     found = ", ".join((*recording.channel_names, *recording.action_names))
+    some = any(channel.name in recorded for channel in channels)
     if missing:
         raise DataError(
             f"{_columns(missing)} missing; the data have {found}. If a log has "
             "other names, --mapping gives it the model's; npdr inspect LOG --model MODEL --write "
             "mapping.toml writes one to start from."
+            + (" Joints that the log lacks can be made fixed in a robot's file." if some else "")
         )
     expected_actions = {action.name for action in actions}
     extra = [name for name in recording.action_names if name not in expected_actions]

@@ -89,7 +89,7 @@ def _find_meshes(spec: Any, folder: Path) -> None:
         if mesh.name in missing:
             spec.delete(mesh)
     if missing:
-        _say_missing(folder, tuple(sorted(set(missing.values()))))
+        _say_missing(folder.resolve(), tuple(sorted(set(missing.values()))))
 
 
 @lru_cache
