@@ -128,7 +128,7 @@ def inspect(
             if missing:
                 typer.echo(f"\nWrote {write}.")
                 typer.echo(_wrapped(f"No signal was found for {', '.join(missing)}."))
-                typer.echo("Name them in the file, check its names and units, then:")
+                typer.echo("Add what is missing, check names and units, then:")
             else:
                 typer.echo(f"\nWrote {write}. Check its names and units, then:")
             typer.echo(f"    npdr fit {model or 'MODEL'} --data {log} --mapping {write} --out fit")

@@ -25,6 +25,10 @@ from npdr_ppl.rollouts.segments import layout_of, motion_by_channel
 
 __all__ = ["RemedyTrials", "Windows", "misfits_of", "relative_misfit", "root_mean_square"]
 
+_LEAST_MOTION = 0.5
+"""Motion of a channel in one of the first segments, as a share of its largest in any. A channel
+that moves half as far shows a unit or a sign as clearly."""
+
 
 class Windows:
     """The segments along which remedies are tried: the same with each of them, where possible.
@@ -54,7 +58,7 @@ class Windows:
             for own in moving.T:
                 # A channel that hardly moves in them would show neither a unit nor a sign.
                 largest = int(used[own[used].argmax()])
-                if own[[*few]].max() < 0.5 * own[largest]:
+                if own[[*few]].max() < _LEAST_MOTION * own[largest]:
                     few.add(largest)
             self.few._places = [layout[k][:2] for k in sorted(few)]
 

@@ -124,12 +124,7 @@ class RunFolder:
         make_folder(self.path)
         description = {
             "format": FORMAT,
-            "backend": method.name,
-            "options": dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {},
-            "binding": _binding(bound.options),
-            "seed": seed,
-            "num_simulations": num_simulations,
-            "code": code_checksum(bound.model),
+            **_asked(bound.model, method, bound.options, seed, num_simulations),
             "fingerprint": _fingerprint(bound.data),
             "features": _sketch(bound.observed_features()),
         }
@@ -305,18 +300,26 @@ def begin_fit(
         DataError: The folder holds a run with other settings or data.
     """
     description = {
-        "backend": method.name,
-        "options": dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {},
-        "binding": _binding(checked_options(options)),
-        "seed": seed,
-        "num_simulations": num_simulations,
-        "code": code_checksum(model),
+        **_asked(model, method, checked_options(options), seed, num_simulations),
         "fingerprint": _fingerprint({"rollouts": rollouts}),
     }
     if not (path / RUN / "run.json").exists():
         write_json(path / ASKED, description)
     elif (path / ASKED).exists():
         holds_this_run(path / ASKED, description)
+
+
+def _asked(
+    model: Model, method: Backend, options: DataOptions, seed: int, num_simulations: int
+) -> dict[str, Any]:
+    return {
+        "backend": method.name,
+        "options": dataclasses.asdict(method) if dataclasses.is_dataclass(method) else {},
+        "binding": _binding(options),
+        "seed": seed,
+        "num_simulations": num_simulations,
+        "code": code_checksum(model),
+    }
 
 
 def _binding(options: DataOptions) -> dict[str, Any]:

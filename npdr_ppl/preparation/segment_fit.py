@@ -16,6 +16,7 @@ of a Furuta pendulum forced steps so small that its masses did not converge.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -110,27 +111,10 @@ def fit_segments(
     first = segments.corrected(end.z, end.offsets, end.scale)
     share = segments.effective_share(first[1].residual)
 
-    def precise(
-        z: Tensor,
-        offsets: Tensor,
-        scale: Tensor,
-        first: _Place | None = None,
-        difference: Tensor | None = None,
-    ) -> SegmentFit:
-        return _steps(
-            segments,
-            z,
-            offsets,
-            scale,
-            held,
-            max_steps,
-            is_rough=False,
-            share=share,
-            first=first,
-            difference=difference,
-        )
-
-    end = precise(end.z, end.offsets, end.scale, first, end.difference)
+    precise = partial(
+        _steps, segments, held=held, max_steps=max_steps, is_rough=False, share=share
+    )
+    end = precise(end.z, end.offsets, end.scale, first=first, difference=end.difference)
     unstuck = _unstuck_offsets(segments, end)
     if unstuck is not None:
         end = precise(end.z, unstuck, end.scale)

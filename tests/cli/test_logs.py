@@ -96,7 +96,8 @@ def test_a_mapping_for_a_model_says_what_the_log_lacks(monkeypatch, capsys, tmp_
     )
     frame.drop(columns="pos_z").to_csv(log, index=False)
     toml.unlink()
-    assert "No signal was found for left hip, a.b, knee." in run(monkeypatch, capsys, *words)[1]
+    out = run(monkeypatch, capsys, *words)[1]
+    assert "No signal was found for left hip, a.b, knee.\nAdd what is missing, " in out
 
 
 @pytest.mark.parametrize(

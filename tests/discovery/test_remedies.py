@@ -456,3 +456,16 @@ def test_early_stamps_must_explain_twice_as_well_as_a_lag_of_the_device(
         pendulum, rollouts, npdr.DataOptions(segment_length=20), None, None, lambda _: None
     )
     assert (found is not None) is is_applied
+
+
+def test_every_channel_moves_in_some_of_the_first_segments():
+    recorded = turned(1.0, 1.0)
+    length = 20
+    for moving in range(0, 30, 7):
+        readings = [array.copy() for array in recorded.readings]
+        own = slice(moving * length, (moving + 1) * length)
+        readings[0][:, 1] = 0.0
+        readings[0][own, 1] = np.linspace(0.0, 5.0, length)
+        changed = dataclasses.replace(recorded, readings=tuple(readings))
+        windows = remedy_trials.Windows(changed, npdr.DataOptions(None, length))
+        assert (0, moving * length) in windows.few._places

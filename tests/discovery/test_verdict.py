@@ -7,6 +7,7 @@ import pytest
 from npdr_ppl.discovery.proof.held_out_gap import Gap
 from npdr_ppl.discovery.search.repeatability import PartEstimate, Repetition
 from npdr_ppl.discovery.verdict import judge as judged
+from npdr_ppl.models.effects import PreslidingFriction
 
 pytestmark = pytest.mark.slow
 
@@ -79,6 +80,11 @@ def test_an_implausible_value_makes_the_verdict_unknown_unless_the_effect_is_min
     assert verdict == "unknown" and "implausible value of drag" in reason
     minor = replace(strained, share=0.05 * drag.share)
     assert judge(effects=[drag, minor])[0] == "named"
+
+
+def test_a_strained_law_is_compared_with_the_simple_laws_that_it_contains(judge, drag):
+    strained = replace(drag, effect=PreslidingFriction("hinge"), at_edge=("deflection",))
+    assert judge(effects=[strained])[1].endswith(" Compare it with hinge.coulomb_friction.")
 
 
 def test_an_uncertain_effect_makes_the_verdict_ambiguous_unless_it_is_minor(judge, drag):

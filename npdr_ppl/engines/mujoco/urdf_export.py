@@ -29,6 +29,9 @@ _DYNAMICS = {"dof_damping": "damping", "dof_frictionloss": "friction"}
 
 _ARMATURE = "dof_armature"
 
+_HINGE = 3
+"""MuJoCo's ``mjJNT_HINGE``."""
+
 _INERTIAL = {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
 
 _ENTRIES = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2),
@@ -75,8 +78,11 @@ def export_urdf(simulator: MujocoMechanism, parameters: Mapping[str, Tensor]) ->
     armatures = [place for array, place in assignments if array == _ARMATURE]
     for dof in armatures:
         joint = simulator.model.joint(int(simulator.model.dof_jntid[dof])).name
+        unit = (
+            "kg m²" if simulator.model.jnt_type[simulator.model.dof_jntid[dof]] == _HINGE else "kg"
+        )
         value = float(assignments.pop((_ARMATURE, dof)))
-        refused[f"armature of {joint}, {value:.6g} kg m² (kg for a slide)"] = (
+        refused[f"armature of {joint}, {value:.6g} {unit}"] = (
             "a URDF file has no place for it; set it in your simulator, or export an .xml file"
         )
     text = _new_text(chosen, before, assignments, simulator.file.parent)
